@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ from calib.core.arrays import AnyArray, BoolArray, FloatArray, GrayImage
 from calib.core.errors import BadInputError
 from calib.stages.camera.lattice import (
     Lattice,
+    checkered,
     extrapolated,
     find_lattices,
     find_saddles,
@@ -65,8 +65,7 @@ def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: 
     turns = [k for k in range(4) if np.rot90(colours, k).shape == (rows, columns)]
     if not turns:
         return None
-    i, j = np.indices((rows, columns))
-    parity = 1.0 - 2.0 * ((i + j) % 2)
+    parity = checkered(rows, columns)
     # Outward of corner (0, 0) is the colour of the square across it, between growing column and row.
     bright = {k: float(np.sum(np.sign(turned_colours(colours, k)) * parity)) > 0 for k in turns}
     if len(set(bright.values())) == 2:
@@ -143,8 +142,7 @@ def _squares_are_plain(grid: Refined) -> bool:
     around = np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 1, 1, 1, 2)
     quarters = sample(grid.part.image, 0.5 * (corners + middle) + around).mean(axis=0)
     tone = quarters.mean(axis=0)
-    i, j = np.indices(tone.shape)
-    bright = grid.sign * (1 - 2 * ((i + j) % 2)) > 0
+    bright = grid.sign * checkered(*tone.shape) > 0
     step = 2.0 * float(np.median(np.abs(grid.amplitude)))
     amplitude = np.abs(grid.amplitude)
     local = 0.5 * (amplitude[:-1, :-1] + amplitude[1:, :-1] + amplitude[:-1, 1:] + amplitude[1:, 1:])
@@ -162,8 +160,7 @@ def _squares_meet(grid: Refined) -> bool:
     """Whether the squares keep their tones up to the corners, as round spots do not that only touch."""
     p = grid.part.from_picture(grid.points)
     along, across = np.gradient(p, axis=1), np.gradient(p, axis=0)
-    i, j = np.indices(p.shape[:2])
-    parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
+    parity = grid.sign * checkered(*p.shape[:2])
 
     def step(share: float) -> float:
         """Median step between the four squares of a corner, at a share of a square from it."""
@@ -238,8 +235,8 @@ class Surroundings:
     seen : whether the picture shows where that row would be.
     """
 
-    continues: tuple[bool, bool, bool, bool]
-    seen: tuple[bool, bool, bool, bool]
+    continues: tuple[bool, ...]
+    seen: tuple[bool, ...]
 
 
 def _ringed(points: FloatArray) -> FloatArray:
@@ -266,8 +263,7 @@ def surroundings(grid: Refined) -> Surroundings:
     outside[:: rows - 1, :: columns - 1] = False
     low, high = np.array([1.0, 1.0]), np.array(image.shape[::-1]) - 2.0
     inside = outside & np.all((local > low) & (local < high), axis=-1)
-    i, j = np.indices((rows, columns))
-    parity = (1.0 - 2.0 * ((i + j) % 2)) * grid.sign
+    parity = grid.sign * checkered(rows, columns)
     least = _CONTINUES * float(np.median(np.abs(grid.amplitude)))
     along, across = np.gradient(local, axis=1), np.gradient(local, axis=0)
     half_step, unlike = looks_like_corners(image, local, along, across)
@@ -291,9 +287,8 @@ def surroundings(grid: Refined) -> Surroundings:
         found[chosen] = fit.converged & near & strong & alike
     hit = found.reshape(rows, columns)
     hits = [int(hit[line].sum()) for line in lines]
-    top, bottom, left, right = (h >= n for h, n in zip(hits, needed, strict=True))
-    above, below, before, after = (n >= 2 for n in count)
-    return Surroundings((top, bottom, left, right), (above, below, before, after))
+    continues = tuple(h >= n for h, n in zip(hits, needed, strict=True))
+    return Surroundings(continues, tuple(n >= 2 for n in count))
 
 
 # ----------------------------------------------------------------------
@@ -428,7 +423,6 @@ def _not_mirrored(grid: FloatArray) -> FloatArray:
 # ----------------------------------------------------------------------
 # How many corners a board of unknown size has.
 
-_LEAST_CORNERS = 9
 _ROUNDS = 12
 _NARROW = 0.65
 """Largest share of corners that only a small window can fit, in a board that nobody asked for."""
@@ -462,23 +456,22 @@ def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
     return None
 
 
-def board_size(gray: GrayImage) -> tuple[int, int] | None:
-    """Size (columns, rows), columns >= rows, of the largest board of one picture."""
+def _size(grid: Refined) -> tuple[int, int]:
+    rows, columns = grid.refined.shape
+    return max(rows, columns), min(rows, columns)
+
+
+def find_size(gray: GrayImage) -> tuple[int, int] | None:
+    """Inner corners (columns, rows), columns >= rows, of the largest board of one picture."""
+    if not _checked(gray):
+        return None
     for zoom in lattice_levels(gray):
         level = resized(gray, zoom)
-        best: tuple[float, tuple[int, int]] | None = None
-        for lattice in find_lattices(find_saddles(level.image), least=6)[:_LATTICES]:
-            points = complete(lattice)
-            grid = None if points is None else _whole(gray, level.to_picture(points))
-            if grid is None or grid.refined.size < _LEAST_CORNERS:
-                continue
-            span = np.ptp(grid.points.reshape(-1, 2), axis=0)
-            area = float(span[0] * span[1])
-            if best is None or area > best[0]:
-                sides = sorted(grid.refined.shape, reverse=True)
-                best = (area, (int(sides[0]), int(sides[1])))
-        if best is not None:
-            return best[1]
+        lattices = find_lattices(find_saddles(level.image), least=6)[:_LATTICES]
+        whole = [_whole(gray, level.to_picture(p)) for p in map(complete, lattices) if p is not None]
+        grids = [grid for grid in whole if grid is not None]
+        if grids:
+            return _size(max(grids, key=lambda grid: np.prod(np.ptp(grid.points, axis=(0, 1)))))
     return _size_by_opencv(gray)
 
 
@@ -495,10 +488,7 @@ def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
     if corners.size != 2 * rows * columns:
         return None
     grid = _whole(gray, level.to_picture(np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)))
-    if grid is None:
-        return None
-    sides = sorted(grid.refined.shape, reverse=True)
-    return int(sides[0]), int(sides[1])
+    return None if grid is None else _size(grid)
 
 
 # ----------------------------------------------------------------------
@@ -607,14 +597,3 @@ def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Det
         if grid is not None:
             return _ordered(grid, columns, rows)
     return None
-
-
-def find_size(gray: GrayImage | Sequence[GrayImage]) -> tuple[int, int] | None:
-    """Inner corners (columns, rows), columns >= rows, of the board in one or more pictures.
-
-    Of several pictures the size that most of them show; of sizes shown equally often the larger.
-    """
-    pictures = [gray] if isinstance(gray, np.ndarray) else list(gray)
-    sizes = (board_size(picture) for picture in pictures if _checked(picture))
-    counts = Counter(size for size in sizes if size is not None)
-    return max(counts, key=lambda size: (counts[size], size[0] * size[1], size), default=None)

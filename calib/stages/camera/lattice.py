@@ -147,9 +147,6 @@ def find_saddles(gray: GrayImage | _Float32) -> Saddles:
     half = _RING_POINTS // 2
     even = 0.5 * (ring[:, :half] + ring[:, half:])
     odd = 0.5 * (ring[:, :half] - ring[:, half:])
-    if len(even) == 0:
-        none = np.zeros(0)
-        return Saddles(np.zeros((0, 2)), none, none, none, smooth, np.zeros((0, 2)))
     # The middle between dark and bright, which the share of bright sectors must not shift.
     even = even - 0.5 * (even.max(axis=1) + even.min(axis=1))[:, None]
     contrast = even.max(axis=1)
@@ -181,6 +178,12 @@ _OCCUPIED = 0.5
 """An outermost row or column with a smaller share of its corners is not part of the board."""
 
 
+def checkered(rows: int, columns: int) -> FloatArray:
+    """+1 and -1 in turn over a grid (rows, columns), +1 at its first place."""
+    i, j = np.indices((rows, columns))
+    return np.asarray(1.0 - 2.0 * ((i + j) % 2))
+
+
 @dataclass(frozen=True)
 class Lattice:
     """Corners of one grid.
@@ -204,8 +207,7 @@ class Lattice:
 
     def colours(self) -> FloatArray:
         """Colour between the growing column and row of each corner, +1 or -1, (rows, columns)."""
-        i, j = np.indices(self.points.shape[:2])
-        return np.asarray(self.sign * (1.0 - 2.0 * ((i + j) % 2)))
+        return self.sign * checkered(*self.points.shape[:2])
 
 
 class _Nearest:
@@ -418,7 +420,7 @@ def _grown(saddles: Saddles, lattice: Lattice, pool: FloatArray, nearest_to: _Ne
         snapped = pool[nearest_to(place[todo], 1)[:, 0]]
         distance = np.linalg.norm(snapped - place[todo], axis=1)
         half_step, unlike = looks_like_corners(saddles.smooth, snapped, along[todo], across[todo])
-        wide = replace(lattice, points=points, sign=lattice.sign)
+        wide = replace(lattice, points=points)
         agrees = wide.colours()[todo] * half_step > 0.35 * lattice.contrast
         good = (distance < _SNAP * square[todo]) & agrees & (unlike < 0.6)
         if not good.any():

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from calib.core.arrays import BoolArray, FloatArray, GrayImage, IntArray
 from calib.core.geometry import linear_homographies
-from calib.stages.camera.lattice import extrapolated
+from calib.stages.camera.lattice import checkered, extrapolated
 
 # ----------------------------------------------------------------------
 # The blurred corner itself, fitted to the grey levels around it, many corners at once.
@@ -744,8 +744,7 @@ class Refined:
     @property
     def sign(self) -> int:
         """+1 where the square between growing column and row of corner (0, 0) is bright, else -1."""
-        i, j = np.indices(self.amplitude.shape)
-        return 1 if np.sum(np.sign(self.amplitude) * (1 - 2 * ((i + j) % 2))) >= 0 else -1
+        return 1 if np.sum(np.sign(self.amplitude) * checkered(*self.amplitude.shape)) >= 0 else -1
 
 
 def square_px(points: FloatArray) -> float:
@@ -860,8 +859,7 @@ def _averaged(gray: GrayImage, k: int) -> _Float32:
 
 def _colours(fit: LocalFit, shape: tuple[int, int]) -> FloatArray:
     """Amplitude (N,), positive where a corner has the colours that most corners give it."""
-    j, i = np.indices(shape)
-    signed = fit.amplitude * (1.0 - 2.0 * ((i + j) % 2)).ravel()
+    signed = fit.amplitude * checkered(*shape).ravel()
     return signed * (1.0 if np.sum(np.sign(signed)) >= 0 else -1.0)
 
 

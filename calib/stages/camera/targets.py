@@ -235,8 +235,9 @@ def with_rows(layout: Layout, ids: Sequence[IntArray]) -> Layout | None:
     return replace(layout, dictionary=dictionary, rows=rows)
 
 
-def _reduced(gray: GrayImage) -> GrayImage:
-    zoom = np.sqrt(_PROBE_PIXELS / gray.size)
+def _reduced(gray: GrayImage, pixels: int) -> GrayImage:
+    """The picture averaged down to about so many pixels."""
+    zoom = np.sqrt(pixels / gray.size)
     if zoom >= 1.0:
         return gray
     return np.asarray(cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -244,7 +245,7 @@ def _reduced(gray: GrayImage) -> GrayImage:
 
 def recognise(pictures: Sequence[GrayImage], dictionary: str | None = None) -> Layout | None:
     """What board of markers these pictures show, of a dictionary or of any; None where there is none."""
-    small = [_reduced(gray) for gray in pictures]
+    small = [_reduced(gray, _PROBE_PIXELS) for gray in pictures]
     ways = [way for way in _WAYS if dictionary is None or way[0] == _largest(dictionary)]
     for gray in small:
         for name, border in ways:
@@ -452,8 +453,7 @@ _MOST_SPOTS = 1.3
 
 def circle_grid(gray: GrayImage) -> tuple[str, int, int] | None:
     """What grid of circles OpenCV finds: "symmetric" or "asymmetric", circles in a row, and rows."""
-    zoom = min(1.0, float(np.sqrt(_CIRCLES_PIXELS / gray.size)))
-    small = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA) if zoom < 1.0 else gray
+    small = _reduced(gray, _CIRCLES_PIXELS)
     parameters = cv2.SimpleBlobDetector.Params()
     parameters.filterByCircularity, parameters.minCircularity = True, _ROUND
     spots = cv2.SimpleBlobDetector.create(parameters)
