@@ -229,7 +229,7 @@ class Live:
         fit, self._saved = None, ""
         try:
             if self.album.names():
-                fit = self.album.calibrate().evidence.fit
+                fit = self.album.calibrate().evidence
                 self._saved = str(self.album.rig)
         except CalibError as error:
             self._saved = f"not saved: {error}"

@@ -18,6 +18,7 @@ from calib.stages.camera.model import (
     Board,
     Camera,
     View,
+    box_grid,
     camera_from_vector,
     pack,
     project,
@@ -29,7 +30,6 @@ from calib.stages.camera.plane import (
     position_sigma,
     settle_orientation,
     to_pixels,
-    workspace_grid,
     world_points_m,
 )
 from calib.stages.camera.pose import (
@@ -612,7 +612,7 @@ def test_what_supports_no_plane_is_refused(view: View, words: str) -> None:
 POINTS_PLANE_SIGMA = Board(7, 5, 0.02).points_m() + np.array([-0.06, 0.02])
 R_TRUE_PLANE_SIGMA = rotation(np.array([0.2, -0.25, 0.1]))
 T_TRUE_PLANE_SIGMA = np.array([0.005, -0.055, 0.3])
-GRID = workspace_grid((-0.06, 0.02, 0.06, 0.1), 5)
+GRID = box_grid((-0.06, 0.02, 0.06, 0.1), 5, 5).reshape(-1, 2)
 # Correlated, as real ones are: focal lengths together, k1 against k2.
 SIGMA_C = np.array([1.2, 1.2, 0.8, 0.7, 0.0, 0.012, 0.08, 0, 0, 0, 0, 0, 0])
 CORRELATION_PLANE_SIGMA = np.eye(13)

@@ -38,9 +38,8 @@ from calib.live.session import ENOUGH, Seen, Session, edge_blur_px
 from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
 from calib.stages.camera.intrinsics import calibrate_camera
-from calib.stages.camera.model import View, pack
+from calib.stages.camera.model import View, box_grid, pack
 from calib.stages.camera.read import BoardFile, Told
-from calib.stages.camera.stage import image_grid
 from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 PICTURE_S = 30.0
@@ -76,11 +75,13 @@ def test_from_the_first_frame_to_enough() -> None:
 def test_guided_pictures_are_worth_twice_as_many_taken_at_random() -> None:
     """Worst projection sigma of twelve pictures, at the same noise of corners, over the whole picture."""
     noise_px, count = 0.1, 12
+    width, height = CAMERA.image_size_px
+    pixels = box_grid((0.0, 0.0, width - 1.0, height - 1.0), 17, 13).reshape(-1, 2)
 
     def worst(views: list[View]) -> float:
         fit = calibrate(pack(views), CAMERA.image_size_px, "radial2")
         known = covariance(fit, noise_px**2)
-        return float(np.nanmax(projection_sigma_px(fit, known, image_grid(CAMERA.image_size_px))))
+        return float(np.nanmax(projection_sigma_px(fit, known, pixels)))
 
     guided, chance = [], []
     for seed in range(4):

@@ -168,7 +168,7 @@ def image_outline(camera: Camera, per_side: int = 9) -> FloatArray:
     border = np.concatenate([top, right, [width - 1, height - 1] - top, [width - 1, height - 1] - right])
     if not camera.fisheye:
         return border
-    centre = np.array([camera.cx_px, camera.cy_px])
+    centre = camera.centre_px
     radius = np.linalg.norm(distorted_normalised(camera, border), axis=1)
     # Rounding must not put the last ones beside the camera.
     share = np.minimum(1.0, (1.0 - 1e-9) * ahead_radius(camera) / radius)

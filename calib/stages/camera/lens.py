@@ -16,6 +16,7 @@ from calib.stages.camera.bundle import Covariance, rotation_exp
 from calib.stages.camera.model import (
     INTRINSICS,
     Camera,
+    box_grid,
     camera_from_vector,
     corner_radius,
     distort,
@@ -28,7 +29,7 @@ from calib.stages.camera.model import (
     undistort,
     vector_from_camera,
 )
-from calib.stages.camera.plane import visible, workspace_grid
+from calib.stages.camera.plane import visible
 from calib.stages.camera.pose import projection_with_derivatives
 from calib.stages.camera.section import InverseLens, Lens
 
@@ -69,12 +70,11 @@ def pixel_grid(
     Every pixel where there are no more than `most`, else evenly spaced ones that include the borders.
     """
     width, height = image_size_px
-    u0, v0, u1, v1 = region_px or (0.0, 0.0, width - 1.0, height - 1.0)
+    u0, v0, u1, v1 = box = region_px or (0.0, 0.0, width - 1.0, height - 1.0)
     columns, rows = round(u1 - u0) + 1, round(v1 - v0) + 1
     shrink = min(1.0, (most / (columns * rows)) ** 0.5)
-    u = np.linspace(u0, u1, max(2, round(columns * shrink)) if columns > 1 else 1)
-    v = np.linspace(v0, v1, max(2, round(rows * shrink)) if rows > 1 else 1)
-    return np.stack(np.meshgrid(u, v), axis=-1)
+    across, down = (max(2, round(n * shrink)) if n > 1 else 1 for n in (columns, rows))
+    return box_grid(box, across, down)
 
 
 def undistort_by_polynomial(camera: Camera, inverse: InverseLens, distorted: AnyArray) -> AnyArray:
@@ -397,7 +397,7 @@ def _once(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 def _on_plane(camera: Camera, plane: PlaneView) -> tuple[dict[str, Any], Region | None]:
     """Cost over the workspace by the section's keys, and the box around it in the picture."""
-    points = workspace_grid(plane.workspace_m, 21)
+    points = box_grid(plane.workspace_m, 21, 21).reshape(-1, 2)
     points = points[visible(camera, plane.R_CW, plane.t_CW_m, points)]
     if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
         return {}, None

@@ -256,11 +256,28 @@ class Camera:
         return not (self.fisheye or np.any(self.distortion))
 
     @property
+    def centre_px(self) -> FloatArray:
+        """Principal point (2,)."""
+        return np.array([self.cx_px, self.cy_px])
+
+    @property
+    def farthest_px(self) -> float:
+        """Distance of the picture's farthest corner from the principal point."""
+        centre, last = self.centre_px, np.array(self.image_size_px) - 1.0
+        return float(np.linalg.norm(np.maximum(centre, last - centre)))
+
+    @property
     def K(self) -> FloatArray:
         """Intrinsic matrix (2.5), shape (3, 3), pixels."""
         return np.array(
             [[self.fx_px, self.skew_px, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
         )
+
+
+def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> FloatArray:
+    """Places (rows, columns, 2) spread evenly over a box (x0, y0, x1, y1), its borders included."""
+    x0, y0, x1, y1 = box
+    return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
 
 
 _SMALL = 1e-9

@@ -13,7 +13,7 @@ from calib.core.errors import BadInputError
 from calib.core.geometry import Homography, apply_homography, fit_homography, map_jacobian
 from calib.core.verdict import Finding, Verdict
 from calib.solve.chance import tail_of_f
-from calib.stages.camera.model import Board, Camera, View, project, undistort
+from calib.stages.camera.model import Board, Camera, View, box_grid, project, undistort
 from calib.stages.camera.pose import Pose, fit_pose, plane_map, pose_derivatives
 
 # ----------------------------------------------------------------------
@@ -66,13 +66,6 @@ class PositionSigma:
     def total_mm(self) -> FloatArray:
         """Everything together, (N, 2)."""
         return np.asarray(np.hypot(self.calibration_mm, self.quantisation_mm))
-
-
-def workspace_grid(workspace_m: tuple[float, float, float, float], side: int = 9) -> FloatArray:
-    """A grid of side x side places over the box (x0, y0, x1, y1), shape (side^2, 2), metres."""
-    x0, y0, x1, y1 = workspace_m
-    x, y = np.meshgrid(np.linspace(x0, x1, side), np.linspace(y0, y1, side))
-    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def visible(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, points_m: FloatArray) -> BoolArray:
@@ -356,8 +349,7 @@ def _of_horizon(camera: Camera, pose: Pose) -> Iterator[Finding]:
     if camera.fisheye:
         return
     width, height = camera.image_size_px
-    u, v = np.meshgrid(np.linspace(0, width - 1, 41), np.linspace(0, height - 1, 31))
-    ideal = undistort(camera, np.stack([u.ravel(), v.ravel()], axis=1))
+    ideal = undistort(camera, box_grid((0.0, 0.0, width - 1.0, height - 1.0), 41, 31).reshape(-1, 2))
     ideal = ideal[np.isfinite(ideal).all(axis=1)]
     last = np.linalg.inv(np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]))[2]
     beyond = float(np.mean(ideal @ last[:2] + last[2] <= 0.0)) if len(ideal) else 0.0
@@ -391,7 +383,7 @@ def _of_precision(
     if pose.other is not None:
         cost, R, t = pose.other
         points = sigma.points_m[seen]
-        pixels = project(camera, points @ pose.R_CW[:, :2].T + pose.t_CW_m)
+        pixels = to_pixels(pose, camera, points)
         apart = 1e3 * np.linalg.norm(plane_map(camera, R, t, pixels) - points, axis=1)
         likely = cost - pose.cost_px2 < 9.0 * pose.sigma_px**2
         if likely and np.nanmax(apart) > 3.0 * float(np.hypot(*calibration_mm.T).max()):
@@ -453,9 +445,9 @@ class Plane(Pose):
         return np.asarray(np.linalg.inv(self.A), dtype=np.float64)
 
 
-def to_pixels(plane: Plane, camera: Camera, world_m: FloatArray) -> FloatArray:
+def to_pixels(pose: Pose, camera: Camera, world_m: FloatArray) -> FloatArray:
     """Distorted pixels (..., 2) of world positions (..., 2), NaN behind the camera."""
-    points_C = world_m @ plane.R_CW[:, :2].T + plane.t_CW_m
+    points_C = world_m @ pose.R_CW[:, :2].T + pose.t_CW_m
     front = points_C[..., 2] > 0.0
     points_C = np.where(front[..., None], points_C, 1.0)
     return np.where(front[..., None], project(camera, points_C), np.nan)
@@ -498,7 +490,7 @@ def calibrate_plane(
     if box is None:
         low, high = world_m.min(axis=0), world_m.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    sigma = position_sigma(camera, camera_covariance, pose, workspace_grid(box))
+    sigma = position_sigma(camera, camera_covariance, pose, box_grid(box, 9, 9).reshape(-1, 2))
     direct = fit_homography(world_m, pixels, groups)
     findings = _findings(camera, pose, (world_m, pixels), comparison, sigma, box, camera_rms_px)
     verdict = Verdict.of(findings)
@@ -515,7 +507,7 @@ def calibrate_plane(
         workspace_m=box,
         sigma=sigma,
         direct=direct,
-        direct_difference_mm=_difference_mm(camera, pose, direct, sigma.points_m),
+        direct_difference_mm=1e3 * np.linalg.norm(moved_m(camera, pose, direct, sigma.points_m), axis=1),
         verdict=verdict,
     )
 
@@ -535,14 +527,13 @@ def _same_points(world_m: FloatArray) -> IntArray:
     return np.unique(keys, axis=0, return_inverse=True)[1].ravel()
 
 
-def _difference_mm(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray) -> FloatArray:
-    """How far apart the two maps put the marker that is at each of the places, (N,); NaN out of sight."""
-    difference = np.full(len(points_m), np.nan)
-    seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m)
-    pixels = project(camera, points_m[seen] @ pose.R_CW[:, :2].T + pose.t_CW_m)
-    other = apply_homography(np.asarray(np.linalg.inv(direct.H), dtype=np.float64), pixels)
-    difference[seen] = 1e3 * np.linalg.norm(other - points_m[seen], axis=1)
-    return difference
+def moved_m(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray) -> FloatArray:
+    """How far the map without a lens moves the marker at each of places (..., 2); NaN out of sight."""
+    seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m.reshape(-1, 2)).reshape(points_m.shape[:-1])
+    moved = np.full(points_m.shape, np.nan)
+    without = np.asarray(np.linalg.inv(direct.H), dtype=np.float64)
+    moved[seen] = apply_homography(without, to_pixels(pose, camera, points_m[seen])) - points_m[seen]
+    return moved
 
 
 # ----------------------------------------------------------------------

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from calib.core.arrays import FloatArray, IntArray
-from calib.core.geometry import apply_homography
 from calib.core.plot import (
     SIGMA,
     WIDTH_IN,
@@ -51,13 +50,8 @@ from calib.stages.camera.lens import (
     radial_sigma,
     shown_once,
 )
-from calib.stages.camera.model import (
-    Camera,
-    focal_px,
-    fold_radius,
-    vector_from_camera,
-)
-from calib.stages.camera.plane import Plane, to_pixels, visible
+from calib.stages.camera.model import Camera, box_grid, focal_px, fold_radius, vector_from_camera
+from calib.stages.camera.plane import Plane, moved_m, to_pixels
 from calib.stages.camera.section import Lens
 
 Size = tuple[int, int]
@@ -120,8 +114,8 @@ def picture(size: Size, marks: Sequence[Mark], title: str = "", empty: str = "")
 def _grid_over(size: Size, across: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Coordinates (columns,), (rows,) and pixels (rows, columns, 2), the cells about square."""
     down = int(np.clip(round(across * size[1] / size[0]), 3, 3 * across))
-    u, v = np.linspace(0.0, size[0] - 1.0, across), np.linspace(0.0, size[1] - 1.0, down)
-    return u, v, np.stack(np.meshgrid(u, v), axis=-1)
+    pixels = box_grid((0.0, 0.0, size[0] - 1.0, size[1] - 1.0), across, down)
+    return pixels[0, :, 0], pixels[:, 0, 1], pixels
 
 
 # ----------------------------------------------------------------------
@@ -306,14 +300,14 @@ def _coverage(fit: Calibration, sigma: Covariance) -> Figure:
     ]
     dot = float(np.clip(math.sqrt(5000.0 / len(pixels)), 1.0, 3.5))
     marks.append(Curve(pixels[:, 0], pixels[:, 1], kind="points", size=dot))
-    centre = np.array([camera.cx_px, camera.cy_px])
+    centre = camera.centre_px
     if np.isfinite(centre).all():
         marks.append(Curve(centre[:1], centre[1:], kind="pluses", colour="red", size=15.0))
     rings, principal = _principal_point(camera, sigma)
     title = "Corners of all views (dots) and the principal point (cross)"
     frame = picture(size, (*marks, *rings[:1]), title)
     title, high = f"Which parts of the picture the {len(pixels)} corners cover", panel_height_in(0.62, size)
-    panels = (frame, principal, _radii(size, centre, pixels))
+    panels = (frame, principal, _radii(camera, pixels))
     return Figure(title, note, panels, max(high, 4.3), mosaic=("AB", "AC"), widths=(1.75, 1.0))
 
 
@@ -346,10 +340,9 @@ def _principal_point(camera: Camera, sigma: Covariance) -> tuple[tuple[Shape, ..
     return rings, Plot(x, y, (*rings, cross), title, around_x, around_y, equal=True, down=True)
 
 
-def _radii(size: Size, centre: FloatArray, pixels: FloatArray) -> Plot:
+def _radii(camera: Camera, pixels: FloatArray) -> Plot:
     """Points by distance from the principal point, out to the picture's farthest corner."""
-    last = float(np.linalg.norm(rectangle(0.0, 0.0, size[0] - 1.0, size[1] - 1.0) - centre, axis=1).max())
-    radius = np.linalg.norm(pixels - centre, axis=1)
+    last, radius = camera.farthest_px, np.linalg.norm(pixels - camera.centre_px, axis=1)
     if not (math.isfinite(last) and np.isfinite(radius).all()):
         return Plot(empty="the principal point is not known", bare=True)
     reached = float(radius.max())
@@ -480,9 +473,7 @@ def _along_radius(
     With the uncertainty of a calibration, and how far its pixels (n, 2) reached.
     """
     x, y = _RADIUS, "moved outwards (px)"
-    centre = np.array([camera.cx_px, camera.cy_px])
-    corner = np.array(camera.image_size_px) - 1.0
-    last = float(np.linalg.norm(np.maximum(centre, corner - centre)))
+    last = camera.farthest_px
     if not (math.isfinite(last) and _finite(camera)):
         return Plot(x, y, empty="not bounded")
     radius_of_fold, distorted = fold_radius(camera)
@@ -505,7 +496,7 @@ def _along_radius(
             title += f", {SIGMA} not bounded"
     marks.append(Curve(radius, moved, size=2.2))
     if pixels is not None:
-        distance = np.linalg.norm(ideal_pixels(camera, pixels) - centre, axis=1)
+        distance = np.linalg.norm(ideal_pixels(camera, pixels) - camera.centre_px, axis=1)
         reached = float(np.nanmax(np.append(distance, 0.0)))
         if reached < last:
             marks.append(Band("x", reached, last, colour="ochre", hatched=True))
@@ -534,7 +525,7 @@ def _displacement(camera: Camera, report: Lens) -> Figure:
         note += " Beyond the dotted line the model folds over."
     u0, v0, u1, v1 = report.region_px
     box = rectangle(u0, v0, u1 - u0, v1 - v0)
-    end = float(np.linalg.norm(box - [camera.cx_px, camera.cy_px], axis=1).max())
+    end = float(np.linalg.norm(box - camera.centre_px, axis=1).max())
     right = _along_radius(camera)
     marks, title = (*right.marks, Rule("x", end, "red")), "Along the radius; red: end of the region"
     right = replace(right, marks=marks, title=title)
@@ -612,14 +603,9 @@ def _plane_sigma(plane: Plane) -> Figure:
 
 def _plane_difference(camera: Camera, plane: Plane) -> Figure:
     """How far a homography fitted without the lens puts the marker from where the calibrated map does."""
-    x0, y0, x1, y1 = plane.workspace_m
-    x, y = np.linspace(x0, x1, _FINE), np.linspace(y0, y1, _FINE)
-    points_m = np.stack(np.meshgrid(x, y), axis=-1)
-    seen = visible(camera, plane.R_CW, plane.t_CW_m, points_m.reshape(-1, 2)).reshape(_FINE, _FINE)
-    without = np.asarray(np.linalg.inv(plane.direct.H), dtype=np.float64)
-    moved_mm = np.full(points_m.shape, np.nan)
-    pixels = to_pixels(plane, camera, points_m[seen])
-    moved_mm[seen] = 1e3 * (apply_homography(without, pixels) - points_m[seen])
+    points_m = box_grid(plane.workspace_m, _FINE, _FINE)
+    x, y = points_m[0, :, 0], points_m[:, 0, 1]
+    moved_mm = 1e3 * moved_m(camera, plane, plane.direct, points_m)
     length = np.linalg.norm(moved_mm, axis=-1)
     finite = length[np.isfinite(length)]
     corners = 1e3 * plane.corners_m
@@ -673,12 +659,9 @@ def _plane_picture(camera: Camera, plane: Plane) -> Figure:
 
 def _pixels(camera: Camera, plane: Plane, world_m: FloatArray) -> FloatArray:
     """Pixels (n, 2) of places on the plane, NaN behind the camera and beyond the lens model's fold."""
-    depth = world_m @ plane.R_CW[2, :2] + plane.t_CW_m[2]
-    across = np.hypot(*(world_m @ plane.R_CW[:2, :2].T + plane.t_CW_m[:2]).T)
-    kept = (depth > 0.0) & (across < fold_radius(camera)[0] * np.where(depth > 0.0, depth, 1.0))
-    pixels = np.full(world_m.shape, np.nan)
-    pixels[kept] = to_pixels(plane, camera, world_m[kept])
-    return pixels
+    x, y, z = (world_m @ plane.R_CW[:, :2].T + plane.t_CW_m).T
+    kept = (z > 0.0) & (np.hypot(x, y) < fold_radius(camera)[0] * np.where(z > 0.0, z, 1.0))
+    return np.where(kept[:, None], to_pixels(plane, camera, world_m), np.nan)
 
 
 def _outline(camera: Camera, plane: Plane) -> list[Mark]:

@@ -12,7 +12,7 @@ from calib.core.stage import Files, Stage
 from calib.core.units import parse_corners, parse_image_size, parse_region_px, parse_square_m
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from calib.core.arrays import FloatArray
     from calib.core.plot import Figure
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from calib.stages.camera import lens, model, plane
     from calib.stages.camera.intrinsics import Candidate, Choices, Intrinsics
     from calib.stages.camera.model import LeftOut
+    from calib.stages.camera.read import ViewSet
     from calib.stages.camera.section import Camera, Lens, Plane
 
 # ----------------------------------------------------------------------
@@ -74,22 +75,11 @@ class IntrinsicsOptions:
 
 @dataclass(frozen=True)
 class IntrinsicsInputs:
-    """Views of a target, files that are not used, and how to calibrate."""
+    """Views of a target, how to calibrate, and how long it took to find the views."""
 
-    views: Sequence[model.View]
-    image_size_px: tuple[int, int]
-    left_out: tuple[LeftOut, ...]
+    found: ViewSet
     choices: Choices
     detect_s: float
-    simulated: bool
-
-
-@dataclass(frozen=True)
-class CameraEvidence:
-    """What a camera was made from."""
-
-    fit: Intrinsics
-    seconds: Mapping[str, float]
 
 
 def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
@@ -110,10 +100,7 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
         files.narrate(remark)
     files.hashes.update(views.hashes)
     choices = Choices(options.model, options.skew, options.loss, options.board, options.keep_all)
-    detect_s = time.perf_counter() - began
-    return IntrinsicsInputs(
-        views.views, views.image_size_px, views.left_out, choices, detect_s, views.simulated
-    )
+    return IntrinsicsInputs(views, choices, time.perf_counter() - began)
 
 
 def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
@@ -123,12 +110,14 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
     from calib.core.result import CovarianceTable, finite_or_none, judged
     from calib.stages.camera.bundle import projection_sigma_px
     from calib.stages.camera.intrinsics import calibrate_camera
-    from calib.stages.camera.model import ahead_radius, distorted_normalised
+    from calib.stages.camera.model import ahead_radius, box_grid, distorted_normalised
     from calib.stages.camera.section import Camera
 
-    result = calibrate_camera(inputs.views, inputs.image_size_px, inputs.choices, inputs.left_out)
+    views = inputs.found
+    result = calibrate_camera(views.views, views.image_size_px, inputs.choices, views.left_out)
     fit, known = result.calibration, result.covariance
-    grid = image_grid(fit.camera.image_size_px)
+    width, height = fit.camera.image_size_px
+    grid = box_grid((0.0, 0.0, width - 1.0, height - 1.0), 17, 13).reshape(-1, 2)
     # Farther out a fisheye lens shows what is beside the camera, or nothing.
     ahead = np.hypot(*distorted_normalised(fit.camera, grid).T) <= ahead_radius(fit.camera)
     sigma_px = projection_sigma_px(fit, known, grid[ahead])
@@ -139,15 +128,14 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         "max": float(bounded.max()) if len(bounded) == len(sigma_px) else None,
     }
     whole = bool(np.all(np.isfinite(known.intrinsics)))
-    finite = bool(np.isfinite(fit.rms_px))
     return Camera(
         **_optics(fit.camera),
         sigma={name: finite_or_none(value) for name, value in known.sigma().items()},
         covariance=CovarianceTable(order=list(known.names), values=known.intrinsics.tolist())
         if whole
         else None,
-        rms_px=fit.rms_px if finite else None,
-        mean_error_px=fit.mean_error_px if finite else None,
+        rms_px=finite_or_none(fit.rms_px),
+        mean_error_px=finite_or_none(fit.mean_error_px),
         projection_sigma_px=projection,
         views=fit.observations.views,
         points=fit.observations.points,
@@ -155,19 +143,9 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         loss=fit.loss,
         termination=fit.termination,
         rejected=[str(one) for one in result.left_out if one.kind in ("copy", "view", "points")],
-        simulated=inputs.simulated,
+        simulated=views.simulated,
         **judged(result.verdict),
-    ).with_evidence(CameraEvidence(result, {"detect": inputs.detect_s, **result.seconds}))
-
-
-def image_grid(image_size_px: tuple[int, int], columns: int = 17, rows: int = 13) -> FloatArray:
-    """Pixels (rows * columns, 2) spread over the whole picture, its borders included."""
-    import numpy as np
-
-    u, v = np.meshgrid(
-        np.linspace(0, image_size_px[0] - 1, columns), np.linspace(0, image_size_px[1] - 1, rows)
-    )
-    return np.stack([u.ravel(), v.ravel()], axis=1)
+    ).with_evidence(replace(result, seconds={"detect": inputs.detect_s, **result.seconds}))
 
 
 def _optics(camera: model.Camera) -> dict[str, Any]:
@@ -199,20 +177,12 @@ def imported_camera(camera: model.Camera, source: str) -> Camera:
 
 
 def _camera_document(camera: Camera) -> dict[str, Any]:
-    evidence: CameraEvidence = camera.evidence
-    fit = evidence.fit.calibration
+    evidence: Intrinsics = camera.evidence
+    fit = evidence.calibration
 
     def compared(candidates: Sequence[Candidate]) -> list[dict[str, Any]]:
-        return [
-            {
-                "name": one.name,
-                "parameters": one.parameters,
-                "fitted_rms_px": one.fitted_rms_px,
-                "held_back_rms_px": one.held_back_rms_px,
-                "flaw": one.flaw,
-            }
-            for one in candidates
-        ]
+        keys = ("name", "parameters", "fitted_rms_px", "held_back_rms_px", "flaw")
+        return [{key: getattr(one, key) for key in keys} for one in candidates]
 
     per_view = [
         {
@@ -232,11 +202,11 @@ def _camera_document(camera: Camera) -> dict[str, Any]:
         )
     ]
     return {
-        "models": compared(evidence.fit.models),
-        "boards": compared(evidence.fit.boards),
-        "not_used": _not_used(evidence.fit.left_out),
+        "models": compared(evidence.models),
+        "boards": compared(evidence.boards),
+        "not_used": _not_used(evidence.left_out),
         "per_view": per_view,
-        "seconds": dict(evidence.seconds),
+        "seconds": evidence.seconds,
     }
 
 
@@ -247,9 +217,9 @@ def _not_used(left_out: Sequence[LeftOut]) -> list[dict[str, str]]:
 def _camera_words(camera: Camera) -> list[Block]:
     from calib.core.words import Line, Table
 
-    evidence: CameraEvidence = camera.evidence
+    evidence: Intrinsics = camera.evidence
     blocks: list[Block] = []
-    for what, candidates in (("model", evidence.fit.models), ("board", evidence.fit.boards)):
+    for what, candidates in (("model", evidence.models), ("board", evidence.boards)):
         if candidates:
             rows = tuple(
                 (one.name, str(one.parameters), f"{one.fitted_rms_px:.4f}", f"{one.held_back_rms_px:.4f}")
@@ -260,18 +230,14 @@ def _camera_words(camera: Camera) -> list[Block]:
             unsound = ", ".join(f"{one.name} ({one.flaw})" for one in candidates if one.flaw)
             if unsound:
                 blocks.append(Line(f"no candidate: {unsound}"))
-    blocks += [Line(f"not used: {one}") for one in evidence.fit.left_out]
+    blocks += [Line(f"not used: {one}") for one in evidence.left_out]
     return blocks
 
 
 def _camera_plots(camera: Camera) -> dict[str, Figure]:
     from calib.stages.camera.plots import plots
 
-    return plots(camera.evidence.fit)
-
-
-def _outdated(rig: Rig) -> list[str]:
-    return rig.outdated()
+    return plots(camera.evidence)
 
 
 intrinsics = Stage(
@@ -291,7 +257,7 @@ intrinsics = Stage(
     document=_camera_document,
     words=_camera_words,
     plots=_camera_plots,
-    remarks=_outdated,
+    remarks=lambda rig: rig.outdated(),
 )
 
 
@@ -317,7 +283,6 @@ class PlaneEvidence:
 
     camera: model.Camera
     fit: plane.Plane
-    orientation: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
 
 
@@ -366,10 +331,9 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         kept = slice(None) if view.measured is None else placed.reordered(view.measured, search.board)
         views.append(View(view.name, world_m[kept], placed.pixels[kept]))
         orientation.append(f"{view.name}: {placed.how}")
-    x0, y0, x1, y1 = rig.workspace_m
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
     return PlaneInputs(
-        rig.camera, views, (x0, y0, x1, y1), tuple(orientation), search.left_out, stated.simulated
+        rig.camera, views, rig.workspace_m, tuple(orientation), search.left_out, stated.simulated
     )
 
 
@@ -432,7 +396,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         orientation=" ".join(inputs.orientation),
         simulated=inputs.simulated,
         **judged(Verdict.of(findings)),
-    ).with_evidence(PlaneEvidence(optics, fit, inputs.orientation, inputs.left_out))
+    ).with_evidence(PlaneEvidence(optics, fit, inputs.left_out))
 
 
 def _plane_document(result: Plane) -> dict[str, Any]:
@@ -474,7 +438,7 @@ extrinsics = Stage(
     document=_plane_document,
     words=_plane_words,
     plots=_plane_plots,
-    remarks=_outdated,
+    remarks=lambda rig: rig.outdated(),
 )
 
 
@@ -515,9 +479,8 @@ def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     view = None
     current = rig.current_plane(files.rig_path)
     if current is not None:
-        x0, y0, x1, y1 = rig.workspace_m
         sigma_mm = current.sigma_marker_mm.get("calibration_max")
-        view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), (x0, y0, x1, y1), sigma_mm)
+        view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), rig.workspace_m, sigma_mm)
     if not rig.camera.verdict.ok:
         word = rig.camera.verdict.word
         files.narrate(f"the camera's own verdict is {word}; what follows is no better than that")

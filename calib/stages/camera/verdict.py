@@ -51,7 +51,7 @@ from calib.stages.camera.checks import (
     view_faults,
     widened,
 )
-from calib.stages.camera.model import Camera, LeftOut, Observations
+from calib.stages.camera.model import Camera, LeftOut, Observations, box_grid
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
@@ -283,9 +283,7 @@ def _of_projection(fit: Calibration, known: Covariance, inflation: float) -> Ite
     """Standard deviation of projection, inflated, where points were seen."""
     sigma_px = np.inf
     outline = hull(fit.observations.pixels[fit.observations.present])
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    u, v = np.meshgrid(np.linspace(low[0], high[0], 14), np.linspace(low[1], high[1], 12))
-    grid = np.stack([u.ravel(), v.ravel()], axis=1)
+    grid = box_grid([*outline.min(axis=0), *outline.max(axis=0)], 14, 12).reshape(-1, 2)
     spread = inflation * projection_sigma_px(fit, known, grid[inside_hull(grid, outline)])
     if np.any(bounded := ~np.isnan(spread)):
         sigma_px = float(np.median(spread[bounded]))
@@ -468,11 +466,8 @@ def _of_coverage(calibration: Calibration) -> Iterator[Finding]:
 def _radius_share(calibration: Calibration) -> float:
     """Largest distance of a point from the principal point over that of the image's farthest corner."""
     camera, observations = calibration.camera, calibration.observations
-    width, height = camera.image_size_px
-    centre = np.array([camera.cx_px, camera.cy_px])
-    corner = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
     seen = observations.pixels[observations.present]
-    return float(np.linalg.norm(seen - centre, axis=1).max() / np.linalg.norm(corner - centre, axis=1).max())
+    return float(np.linalg.norm(seen - camera.centre_px, axis=1).max() / camera.farthest_px)
 
 
 def _of_frame(calibration: Calibration) -> Iterator[Finding]:
