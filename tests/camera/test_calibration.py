@@ -391,7 +391,7 @@ def test_a_richer_model_needs_pixels_and_more_than_chance() -> None:
     assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 1e-5))]) == 0
     assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 5e-3))]) == 1
     # At 4000 pixels' width a fiftieth of a pixel counts.
-    assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 5e-4))], 4000) == 0
+    assert simplest_good([_candidate("simple", *noise), _candidate("rich", *(noise - 5e-4))], 4.0) == 0
     other = 0.2 * np.exp(0.1 * rng.standard_normal(20))
     assert simplest_good([_candidate("simple", *noise), _candidate("rich", *other)]) == 0
     # Three views tell little of chance; a fifth less is taken all the same.
@@ -401,9 +401,9 @@ def test_a_richer_model_needs_pixels_and_more_than_chance() -> None:
 
 def test_a_lens_that_folds_is_chosen_only_where_the_others_are_hopeless() -> None:
     folding = _candidate("radial3", *[0.1] * 12, soundness=1)
-    assert chosen_lens([_candidate("radial2", *[0.25] * 12), folding], 640) == 0
-    assert chosen_lens([_candidate("radial2", *[4.2] * 12), folding], 640) == 1
-    assert chosen_lens([_candidate("radial2", *[4.2] * 12), replace(folding, soundness=0)], 640) == 0
+    assert chosen_lens([_candidate("radial2", *[0.25] * 12), folding]) == 0
+    assert chosen_lens([_candidate("radial2", *[4.2] * 12), folding]) == 1
+    assert chosen_lens([_candidate("radial2", *[4.2] * 12), replace(folding, soundness=0)]) == 0
 
 
 def _equidistant(field_deg: float) -> Camera:

@@ -510,7 +510,7 @@ def _basis(calibration: Calibration) -> tuple[FloatArray, float]:
 
 def target_shape(calibration: Calibration) -> TargetShape | None:
     """Deformation of the target; None where the data are too few to say."""
-    if calibration.degrees_of_freedom <= 2 * len(DEFORMATIONS) or len(calibration.free) == 0:
+    if calibration.degrees_of_freedom <= 2 * len(DEFORMATIONS):
         return None
     basis, half = _basis(calibration)
     found = evidence(calibration, basis, DEFORMATIONS)
@@ -526,17 +526,15 @@ def target_shape(calibration: Calibration) -> TargetShape | None:
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     bows = step[P + 2 :]
     wald = float(bows @ np.linalg.pinv(cov[P + 2 :, P + 2 :], hermitian=True) @ bows)
-    fx_at = found.names.index("fx_px") if "fx_px" in found.names else -1
-    fx = calibration.camera.fx_px
-    coupling = -scaled_inverse(S[:P, :P]) @ S[:P, P:] if fx_at >= 0 else np.zeros((1, 5))
-    row = coupling[fx_at] if fx_at >= 0 else coupling[0]
+    fx_at, fx = found.names.index("fx_px"), calibration.camera.fx_px
+    row = (-scaled_inverse(S[:P, :P]) @ S[:P, P:])[fx_at]
     return TargetShape(
         aspect=float(step[P]),
         aspect_sigma=float(sigma[P]),
         bow_m=float(np.ptp(np.tensordot(bows, basis[..., 2:, 2, :], axes=(0, basis.ndim - 3)))),
         bow_significance=float(np.sqrt(wald / 3)),
         size_m=2 * half,
-        focal_shift=float(step[fx_at] / fx) if fx_at >= 0 else 0.0,
+        focal_shift=float(step[fx_at] / fx),
         focal_per_bow=float(np.abs(row[2:4]).max() * 0.01 * half / fx),
         values=step[P:],
         sigma=sigma[P:],
@@ -558,7 +556,7 @@ FOCAL_STARTS = (0.4, 0.7, 1.1, 1.8, 4.0)
 FISHEYE_STARTS = (0.2, 0.3, 0.45, 0.8)
 """Focal lengths of the starts, over the longer side of the image."""
 
-_CHI2_95 = 3.84
+CHI2_95 = 3.84
 _MAX_ITERATIONS = 60
 _MAX_VIEWS = 60
 _NEARLY = 1.02
@@ -627,7 +625,7 @@ def best_of_starts(calibration: Calibration) -> Calibration:
     if calibration.basis is not None or calibration.loss != "none":
         return calibration
     some, views = calibration, calibration.observations.views
-    chance = _CHI2_95 * calibration.sigma_px**2
+    chance = CHI2_95 * calibration.sigma_px**2
     if views > _MAX_VIEWS:
         index = np.unique(np.linspace(0, views - 1, _MAX_VIEWS).astype(np.int64))
         some = replace(
@@ -652,7 +650,7 @@ def best_of_starts(calibration: Calibration) -> Calibration:
         if not start.posed.all():
             return calibration
     better = refitted(calibration, start=start)
-    return better if _cost(better) < _cost(calibration) - _CHI2_95 * better.sigma_px**2 else calibration
+    return better if _cost(better) < _cost(calibration) - CHI2_95 * better.sigma_px**2 else calibration
 
 
 def _cost(calibration: Calibration) -> float:

@@ -48,6 +48,7 @@ from calib.stages.camera.model import (
     View,
     free_intrinsics,
     pack,
+    scale_of,
 )
 from calib.stages.camera.triage import Triage, triage, turned_views
 from calib.stages.camera.verdict import (
@@ -55,7 +56,6 @@ from calib.stages.camera.verdict import (
     of_copies,
     of_faults,
     of_leaving,
-    scale_of,
     two_cameras,
 )
 
@@ -202,7 +202,7 @@ def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
     views = fits[0].observations.views
     folds = _folds(views)
     squared = np.array([_by_evidence(fit, folds) for fit in fits])
-    gain_px2 = (_GAIN_PX * scale_of(fits[0].camera)) ** 2
+    gain_px2 = (_GAIN_PX * scale_of(fits[0].camera.image_size_px)) ** 2
     rational = np.array([fit.camera.model == "rational8" for fit in fits])
     goal = np.median(squared[~rational], axis=1).min(initial=np.inf) - gain_px2
     bent = [
@@ -269,7 +269,6 @@ def candidates_by_model(
     skew: bool = False,
     fixed: tuple[str, ...] = (),
     loss: str = "none",
-    models: Sequence[str] = tuple(MODELS),
 ) -> list[tuple[Candidate, Calibration]]:
     """Every lens model fitted to all views and judged on views held back, the simplest first.
 
@@ -293,14 +292,14 @@ def candidates_by_model(
         )
         return None if fit.termination in ("behind the camera", "singular") else fit
 
-    for model in models:
+    for model in MODELS:
         fit = None if model == FISHEYE else fitted(model, fits[-1].block if fits else None)
         if fit is not None and model == "rational8" and not skew and not fixed:
             fit = _sturdier(fit, fits)
         fits += [] if fit is None else [fit]
-    if FISHEYE in models and any(map(_wide, fits)):
-        fit = fitted(FISHEYE, None)
-        fits = sorted(fits if fit is None else [*fits, fit], key=lambda one: models.index(one.camera.model))
+    if any(map(_wide, fits)):
+        fit, order = fitted(FISHEYE, None), list(MODELS)
+        fits = sorted(fits if fit is None else [*fits, fit], key=lambda one: order.index(one.camera.model))
     held = _on_held_back(fits)
     return [
         (_candidate(str(LensModel.of(fit)), fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)
@@ -341,9 +340,7 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
     return min(fits, key=lambda one: (one.rms_px > _SAME * least, not lens_shape(one).one_to_one, one.rms_px))
 
 
-def candidates_by_board(
-    rigid: Calibration, kinds: Sequence[str] = BOARDS
-) -> list[tuple[Candidate, Calibration]]:
+def candidates_by_board(rigid: Calibration) -> list[tuple[Candidate, Calibration]]:
     """The same camera model with each board model, judged on views held back.
 
     Only for targets whose points are the same in every view; otherwise the rigid board alone.
@@ -351,7 +348,7 @@ def candidates_by_board(
     observations = rigid.observations
     names: list[str] = []
     fits: list[Calibration] = []
-    for kind in kinds:
+    for kind in BOARDS:
         if kind != "rigid" and not observations.same_target:
             continue
         basis = board_basis(observations.target_m[0], kind)
@@ -370,22 +367,21 @@ def candidates_by_board(
     return [(_candidate(names[i], fit, held[i]), fit) for i, fit in enumerate(fits)]
 
 
-def simplest_good(candidates: Sequence[Candidate], width_px: int = 0) -> int:
+def simplest_good(candidates: Sequence[Candidate], scale: float = 1.0) -> int:
     """Index of the simplest candidate that the richer ones do not beat on views held back.
 
     Parameters
     ----------
-    width_px : larger side of the picture; the pixels that matter grow with it above 1000.
+    scale : `scale_of` the picture.
     """
-    gain_px = _GAIN_PX * max(1.0, width_px / 1000)
     chosen = 0
     for index in range(1, len(candidates)):
-        if _beats(candidates[index], candidates[chosen], gain_px):
+        if _beats(candidates[index], candidates[chosen], _GAIN_PX * scale):
             chosen = index
     return chosen
 
 
-def chosen_lens(candidates: Sequence[Candidate], width_px: int) -> int:
+def chosen_lens(candidates: Sequence[Candidate], scale: float = 1.0) -> int:
     """Index of the simplest good lens model among the sound ones.
 
     A sound model that leaves far larger errors than one that is not gives way: a lens that is known where
@@ -397,10 +393,10 @@ def chosen_lens(candidates: Sequence[Candidate], width_px: int) -> int:
     for least in (3, 2, 1):
         index = [i for i, one in enumerate(candidates) if one.soundness >= least]
         if index:
-            best = index[simplest_good([candidates[i] for i in index], width_px)]
+            best = index[simplest_good([candidates[i] for i in index], scale)]
             if not candidates[best].held_back_rms_px > _HOPELESS_RATIO * min(usable, default=np.inf):
                 return best
-    return simplest_good(candidates, width_px)
+    return simplest_good(candidates, scale)
 
 
 def _beats(richer: Candidate, simpler: Candidate, gain_px: float) -> bool:
@@ -526,12 +522,11 @@ def _chosen_model(
         return LensModel(choices.model, asked), None, ()
     if observations.views < 3:
         return LensModel("radial2" if observations.views == 2 else "pinhole", asked), None, ()
-    width = max(image_size_px)
 
     def compared(skew: bool) -> tuple[list[Candidate], list[Calibration], int]:
         found = candidates_by_model(observations, image_size_px, skew=skew, fixed=fixed, loss=choices.loss)
         candidates = [replace(one, soundness=0) if one.name in excluded else one for one, _ in found]
-        return candidates, [fit for _, fit in found], chosen_lens(candidates, width)
+        return candidates, [fit for _, fit in found], chosen_lens(candidates, scale_of(image_size_px))
 
     candidates, fits, best = compared(asked)
     if not fits:
@@ -552,7 +547,7 @@ def _skewed(fit: Calibration) -> bool:
     found = skew_left_out(fit)
     return (
         abs(found.skew_px) > _SKEW_SIGMAS * found.sigma_px
-        and found.moved_px > _SKEW_PX * scale_of(fit.camera)
+        and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px)
         and found.shear_chi2 < _SKEW_SIGMAS**2
     )
 
@@ -678,7 +673,7 @@ def _moved_px(found: Triage) -> float:
     """By how much all views and those that agree put directions apart, over `scale_of` the camera."""
     every, some = found.everything, found.calibration
     difference = (every.block.intrinsics - some.block.intrinsics)[some.free]
-    return apart_px(some, difference) / scale_of(some.camera)
+    return apart_px(some, difference) / scale_of(some.camera.image_size_px)
 
 
 def _sorted_out(
@@ -767,7 +762,7 @@ def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str,
         return rigid, "rigid", ()
     if choices.board == "auto":
         found = candidates_by_board(rigid)
-        best = simplest_good([candidate for candidate, _ in found], max(rigid.camera.image_size_px))
+        best = simplest_good([candidate for candidate, _ in found], scale_of(rigid.camera.image_size_px))
         return found[best][1], found[best][0].name, tuple(candidate for candidate, _ in found)
     observations = rigid.observations
     basis = board_basis(observations.target_m[0], choices.board)

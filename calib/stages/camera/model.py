@@ -280,6 +280,11 @@ def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> Floa
     return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
 
 
+def scale_of(image_size_px: tuple[int, int]) -> float:
+    """How many times larger than at up to 1000 pixels' width errors in pixels may be."""
+    return max(1.0, max(image_size_px) / 1000)
+
+
 _SMALL = 1e-9
 """Radius below which a direction is the axis, rad."""
 _BEHIND = 0.05

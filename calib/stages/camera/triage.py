@@ -36,9 +36,17 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
-from calib.stages.camera.checks import Evidence, apart_px, evidence, overdispersion, points_C, scaled_inverse
-from calib.stages.camera.model import Block, LeftOut, Observations, project
-from calib.stages.camera.verdict import listed
+from calib.stages.camera.checks import (
+    Evidence,
+    apart_px,
+    evidence,
+    gain,
+    overdispersion,
+    points_C,
+    scaled_inverse,
+)
+from calib.stages.camera.model import Block, LeftOut, Observations, project, scale_of
+from calib.stages.camera.verdict import Limits, far_points, listed, quiet_rms
 
 _LEAST_VIEWS = 5
 """Views below which none can be told to disagree with the others."""
@@ -57,12 +65,6 @@ _MOVED_SIGMAS = 1.0
 _MOVED_PX = 0.02
 """A view matters that moves a parameter, and a direction in the picture, by more than this; pixels at up to
 1000 pixels' width."""
-_MISFIT = 5.0
-_MISFIT_PX = 0.5
-"""A view matters as well whose RMS is this many times that of the quieter views, and this many pixels."""
-_POINT = 8.0
-_POINT_PX = 0.5
-"""A point leaves that lies this many medians, and pixels, off."""
 _POINTS_SHARE = 0.3
 """A view that loses more of its points than this leaves whole."""
 _TOLD = 1e-3
@@ -100,12 +102,11 @@ class Agreement:
     sigma: FloatArray
     scale_px: float
 
-    def leaving(self, width_px: int) -> BoolArray:
-        """Views that are odd, and matter."""
-        scale = max(1.0, width_px / 1000)
+    def leaving(self, scale: float) -> BoolArray:
+        """Views that are odd, and matter, in a picture with this `scale_of`."""
         odd = (self.chance < _CHANCE) | (self.noise > _ODD_NOISE)
         moves = (self.moved > _MOVED_SIGMAS) & (self.moved_px > _MOVED_PX * scale)
-        misfits = (self.misfit > _MISFIT) & (self.rms_px > _MISFIT_PX)
+        misfits = (self.misfit > Limits.view_bad) & (self.rms_px > Limits.point_floor_px)
         return np.asarray(odd & moves | misfits)
 
 
@@ -170,8 +171,8 @@ def _first_core(S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArr
     every = np.ones(N, dtype=np.bool_)
     whole = S.sum(axis=0)
     others = whole - S + 1e-9 * np.trace(whole) / len(whole) * np.eye(len(whole))
-    gain = np.einsum("ng,ng->n", b, np.linalg.solve(others, b[..., None])[..., 0])
-    odd = np.argsort(-gain)[:_ODD_STARTS]
+    gains = np.einsum("ng,ng->n", b, np.linalg.solve(others, b[..., None])[..., 0])
+    odd = np.argsort(-gains)[:_ODD_STARTS]
     starts = [every, *(every & (np.arange(N) != i) for i in odd)]
     starts += [every & ~np.isin(np.arange(N), pair) for pair in combinations(odd, 2)]
     best, least = every, np.inf
@@ -209,7 +210,6 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
     joined = np.linalg.solve(one.S_core + S + 1e-12 * np.eye(len(sigma)), one.score[..., None])[..., 0]
     shift = np.where(core[:, None], one.d - centre, joined)
     rms = np.sqrt(found.cost / np.maximum(found.measured / 2, 1))
-    quiet = np.sort(rms[core])[: (int(core.sum()) + 1) // 2]
     noise = np.sqrt(one.variance)
     return Agreement(
         shift=shift * unit,
@@ -219,7 +219,7 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
         noise_px=noise,
         noise=noise / np.sqrt(one.typical),
         rms_px=rms,
-        misfit=rms / max(float(np.median(quiet)), 1e-12),
+        misfit=rms / max(quiet_rms(rms[core]), 1e-12),
         sigma=sigma * unit,
         scale_px=float(np.sqrt(one.typical * one.phi2)),
     )
@@ -271,8 +271,8 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
     ----------
     calibration : of all views, the target rigid, without robust loss.
     """
-    N, width = calibration.observations.views, max(calibration.camera.image_size_px)
-    if N < _LEAST_TURNED or not len(calibration.free):
+    N = calibration.observations.views
+    if N < _LEAST_TURNED:
         return []
     try:
         found = evidence(calibration)
@@ -292,7 +292,7 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
         of = turned.astype(np.int64), np.arange(N)
         sigma_px = np.sqrt(max(total, 0.0) / max(calibration.degrees_of_freedom, 1))
         at_d = replace(found, S=S[of], b=b[of] + S[of] @ d, sigma_px=float(sigma_px))
-        least = found.cost - np.einsum("ng,ngh,nh->n", found.b, scaled_inverse(found.S), found.b)
+        least = found.cost - gain(found.S, found.b)
         least_gain = (_TURN_SIGMAS * overdispersion(at_d) * sigma_px) ** 2
         # Where they explain it alike a picture was turned: that happens more often.
         if best is not None and total > best[0] - least_gain:
@@ -311,7 +311,7 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
         return []
     _, how, which, difference = best
     moved_px = apart_px(calibration, difference)
-    if moved_px < _TURN_PX * max(1.0, width / 1000):
+    if moved_px < _TURN_PX * scale_of(calibration.camera.image_size_px):
         return []
     why = (
         f"agrees with the camera of the {N - int(which.sum())} others if it was {how} after it was taken, "
@@ -323,7 +323,7 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
 def _without_one(found: Evidence) -> float:
     """Least cost of a reading of all views but one, with the camera that suits these."""
     S, b = found.S.sum(axis=0) - found.S, found.b.sum(axis=0) - found.b
-    cost = found.cost.sum() - found.cost - np.einsum("ng,ngh,nh->n", b, scaled_inverse(S), b)
+    cost = found.cost.sum() - found.cost - gain(S, b)
     return float((cost / (found.measured.sum() - found.measured)).min())
 
 
@@ -435,20 +435,22 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
     """The search from all views, or from the core that agrees best."""
     everything = calibration.observations
     views = everything.views
-    width = max(calibration.camera.image_size_px)
+    scale = scale_of(calibration.camera.image_size_px)
     kept, far = np.ones(views, dtype=np.bool_), np.zeros(everything.present.shape, dtype=np.bool_)
     reasons: dict[int, str] = {}
     scale_px = 0.0
     fit = calibration
     for turn in range(_ROUNDS):
         whole, seen = _with_all(fit, kept, everything, far)
-        new_far, distance = _far_points(whole.residuals_px, kept)
+        distance = np.linalg.norm(whole.residuals_px, axis=2)
+        there = np.isfinite(distance)
+        new_far = far_points(distance, there, float(np.median(distance[there & kept[:, None]])))
         share = new_far.sum(axis=1) / everything.present.sum(axis=1)
         nowhere = "no pose of the board explains it with the other views' camera"
         why = {int(i): nowhere for i in np.flatnonzero(~seen)}
         for i in np.flatnonzero(share > _POINTS_SHARE):
             why[int(i)] = f"{share[i]:.0%} of its points lie far from where the others put them"
-        if views - len(why) >= _LEAST_VIEWS and len(fit.free):
+        if views - len(why) >= _LEAST_VIEWS:
             usable = np.flatnonzero([i not in why for i in range(views)])
             part = replace(
                 whole,
@@ -459,7 +461,7 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
             scale_px = asked.scale_px
             # A view is asked again without its far points before it leaves for them.
             fresh = kept & (new_far & ~far).any(axis=1)
-            leaves = asked.leaving(width) & ~fresh[usable]
+            leaves = asked.leaving(scale) & ~fresh[usable]
             why |= {
                 int(usable[k]): _sentence(asked, int(k), part, int((~leaves).sum()))
                 for k in np.flatnonzero(leaves)
@@ -504,16 +506,6 @@ def _with_all(
     residuals[~everything.present | ~seen[:, None]] = np.nan
     block = Block.of(fit.camera, R_CT, t_CT_m)
     return replace(fit, observations=near, block=block, residuals_px=residuals), seen
-
-
-def _far_points(residuals_px: FloatArray, kept: BoolArray) -> tuple[BoolArray, FloatArray]:
-    """Points (N, M) far off beside the others of their view and of the views that stay, and how far, px."""
-    distance = np.linalg.norm(residuals_px, axis=2)
-    there = np.isfinite(distance)
-    typical = float(np.median(distance[there & kept[:, None]]))
-    own = np.array([np.median(d[on]) if on.any() else typical for d, on in zip(distance, there, strict=True)])
-    limit = np.maximum(_POINT * np.maximum(own, typical), _POINT_PX)
-    return np.asarray(there & (np.nan_to_num(distance) > limit[:, None])), distance
 
 
 def _sentence(asked: Agreement, i: int, calibration: Calibration, others: int) -> str:

@@ -31,6 +31,7 @@ from calib.stages.camera.bundle import (
     refitted,
 )
 from calib.stages.camera.checks import (
+    CHI2_95,
     FAULTS,
     ONE_TO_ONE_REACH,
     Split,
@@ -51,7 +52,7 @@ from calib.stages.camera.checks import (
     view_faults,
     widened,
 )
-from calib.stages.camera.model import Camera, LeftOut, Observations, box_grid
+from calib.stages.camera.model import LeftOut, Observations, box_grid, scale_of
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
@@ -152,17 +153,11 @@ class Limits:
     rival_focal = 0.10
 
 
-_CHI2_95 = 3.84
 _MORE_TILT = "Tilt the board by 30 degrees or more, about its long and its short side in turn."
 _MORE_VIEWS = "Take at least ten pictures with the board tilted in different directions."
 _IN_CORNERS = "Take pictures with the board in the picture's corners, or use a simpler model."
 _CORNERS = "Take pictures with the board in the picture's corners."
 _CLOSER = "Bring the board closer, so that it fills a third of the picture or more, and into its corners."
-
-
-def scale_of(camera: Camera) -> float:
-    """How many times larger than at up to 1000 pixels' width errors in pixels may be."""
-    return max(1.0, max(camera.image_size_px) / 1000)
 
 
 # ----------------------------------------------------------------------
@@ -325,7 +320,7 @@ def _of_starts(calibration: Calibration, inflation: float) -> Iterator[Finding]:
     Worse by more than chance is not clear enough where the model itself is in error, so that a minimum
     far away with a cost a tenth higher counts as a rival, too.
     """
-    own, chance = calibration.squared_sum, _CHI2_95 * (inflation * calibration.sigma_px) ** 2
+    own, chance = calibration.squared_sum, CHI2_95 * (inflation * calibration.sigma_px) ** 2
     fx = calibration.camera.fx_px
     near = max(0.02, 5 * inflation * covariance(calibration).sigma()["fx_px"] / fx)
     for focal_px, end in sorted(other_starts(calibration), key=lambda one: one[1].cost):
@@ -511,10 +506,8 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
     names, present = calibration.observations.names, calibration.observations.present
     squared = np.where(present, (calibration.residuals_px**2).sum(axis=2), 0.0)
     rms = np.sqrt(squared.sum(axis=1) / np.maximum(present.sum(axis=1), 1))
-    # A bad view drags the camera and raises its neighbours' residuals, so the lower half is the measure.
     typical = float(np.median(rms))
-    quiet = float(np.median(np.sort(rms)[: (len(rms) + 1) // 2]))
-    bad = rms > max(Limits.view_bad * quiet, Limits.point_floor_px)
+    bad = rms > max(Limits.view_bad * quiet_rms(rms), Limits.point_floor_px)
 
     def with_rms(which: Sequence[int]) -> str:
         return listed([f"{names[i]} ({rms[i]:.2f} px)" for i in which], 4)
@@ -534,7 +527,7 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
             f"a typical view ({typical:.2f} px)."
         )
         yield Finding("remark", text)
-    limit = Limits.rms_px * scale_of(calibration.camera)
+    limit = Limits.rms_px * scale_of(calibration.camera.image_size_px)
     if typical > limit:
         text = (
             f"The RMS error of a typical view is {typical:.2f} px (at most {limit:.1f} is good): "
@@ -561,12 +554,21 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
         yield Finding("remark", text, "Use a robust loss, or look at these corners.")
 
 
+def far_points(distance: FloatArray, there: BoolArray, typical: float) -> BoolArray:
+    """Points (N, M), of those that are there, far off beside the others of their view and a typical one."""
+    own = np.array([np.median(d[on]) if on.any() else 0.0 for d, on in zip(distance, there, strict=True)])
+    limit = np.maximum(Limits.point_factor * np.maximum(own, typical), Limits.point_floor_px)
+    return np.asarray(there & (np.nan_to_num(distance) > limit[:, None]))
+
+
+def quiet_rms(rms: FloatArray) -> float:
+    """Typical RMS of the quieter half of views (n,), as a bad one drags the camera and raises the others'."""
+    return float(np.median(np.sort(rms)[: (len(rms) + 1) // 2]))
+
+
 def _of_points(distance: FloatArray, fine: BoolArray, names: tuple[str, ...]) -> Iterator[Finding]:
     """Points (N, M) of good views whose residuals are far above those of their view, and of all."""
-    everything = float(np.median(distance[fine])) if fine.any() else 0.0
-    own = np.array([np.median(d[on]) if on.any() else 0.0 for d, on in zip(distance, fine, strict=True)])
-    median = np.maximum(own, everything)
-    bad = fine & (distance > np.maximum(Limits.point_factor * median[:, None], Limits.point_floor_px))
+    bad = far_points(distance, fine, float(np.median(distance[fine])) if fine.any() else 0.0)
     count = int(bad.sum())
     if count:
         share = count / int(fine.sum())
@@ -604,7 +606,7 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
         return
     shift = {name: abs(found.difference[name]) / max(found.sigma[name], 1e-300) for name in found.difference}
     camera, names = calibration.camera, calibration.observations.names
-    width = max(camera.image_size_px)
+    width, larger = max(camera.image_size_px), scale_of(camera.image_size_px)
     scale = {"fx_px": camera.fx_px, "fy_px": camera.fy_px, "cx_px": width, "cy_px": width}
     # Distortion alone tells no two cameras apart; it follows the part of the picture that was seen.
     telling = [
@@ -612,10 +614,10 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
         for name, value in scale.items()
         if shift.get(name, 0.0) > Limits.split_sigma
         and abs(found.difference[name]) > Limits.split_least * value
-        and found.apart_px > Limits.split_px * scale_of(camera)
+        and found.apart_px > Limits.split_px * larger
     ]
     strongest = max(telling or shift, key=lambda name: shift[name])
-    if shift[strongest] < Limits.split_sigma or found.apart_px < Limits.split_seen_px * scale_of(camera):
+    if shift[strongest] < Limits.split_sigma or found.apart_px < Limits.split_seen_px * larger:
         return
     by = ", ".join(
         f"{name.removesuffix('_px')} by {found.difference[name]:+.1f} px"
@@ -749,8 +751,7 @@ def _by_the_rules(
         share = max(share, _focal_share(calibration, covariance(calibration) if found is None else found))
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
-    if "fx_px" in known.names:
-        findings += _of_starts(some, inflation)
+    findings += _of_starts(some, inflation)
     findings += _of_projection(sturdy, known, inflation)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = widened(some)
@@ -784,10 +785,9 @@ def _plain(calibration: Calibration) -> Calibration:
 
 
 def _focal_share(fit: Calibration, known: Covariance) -> float:
-    """Larger relative standard deviation of the focal lengths; zero where they are held."""
+    """Larger relative standard deviation of the focal lengths."""
     sigma = known.sigma()
-    shares = [sigma[name] / getattr(fit.camera, name) for name in ("fx_px", "fy_px") if name in sigma]
-    return float(max(shares, default=0.0))
+    return max(sigma["fx_px"] / fit.camera.fx_px, sigma["fy_px"] / fit.camera.fy_px)
 
 
 def _sampled(fit: Calibration) -> Calibration:
