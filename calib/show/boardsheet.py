@@ -21,7 +21,6 @@ from calib.stages.camera.targets import dictionary_of
 PAGES_MM: dict[str, tuple[float, float]] = {
     "A4": (210.0, 297.0),
     "Letter": (215.9, 279.4),
-    "A3": (297.0, 420.0),
 }
 """Width and height of a page held upright, millimetres."""
 
@@ -216,13 +215,9 @@ def board_pdf(
 
     Raises
     ------
-    BadInputError : no such page, no such board, or squares too large for the page.
+    BadInputError : squares too small to print, or too large for the page.
     """
-    if page not in PAGES_MM:
-        raise BadInputError(f"no page is called {page!r}; there are {', '.join(PAGES_MM)}")
-    if columns < 2 or rows < 2:
-        raise BadInputError(f"a board needs at least 2x2 inner corners, not {columns}x{rows}")
-    if not (math.isfinite(square_m) and square_m >= 0.0005):
+    if not square_m >= 0.0005:
         raise BadInputError(f"a square needs a side of at least 0.5 mm, not {square_m * 1000.0:g} mm")
     square = square_m * 1000.0
     layout = _layout(columns, rows, square, page)

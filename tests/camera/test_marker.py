@@ -200,7 +200,7 @@ def test_a_disc_of_another_size_is_refused(tmp_path: Path, diameter_m: float, fi
     place = np.array([[0.0, 0.08], [0.007, 0.08], [0.0, 0.087]])
     middle, *ends = disc.plane.to_pixels(place, disc.camera)
     axes = np.array([np.hypot(*(end - middle)) for end in ends])
-    seen = Disc(middle, 0.05, axes, (0, 0, 1, 1), 0.0)
+    seen = Disc(middle, 0.05, axes, (0, 0, 1, 1))
     if fits:
         disc.refuse_size([seen])
     else:

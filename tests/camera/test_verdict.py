@@ -50,7 +50,7 @@ from synthetic import views_of
 
 def _judged(views: list[View], size_px: tuple[int, int], model: str) -> tuple[Calibration, Verdict]:
     fit = calibrate(without_copies(pack(views), size_px)[0], size_px, model)
-    return fit, judge(fit, covariance(fit))
+    return fit, judge(fit)
 
 
 @pytest.mark.parametrize("model", list(MODELS))
@@ -192,7 +192,7 @@ def test_sigma_covers_the_truth_where_five_of_35_frames_are_copies(still: str) -
 def test_a_robust_loss_saves_a_set_with_outliers(loss: str) -> None:
     views, camera = BAD["outliers"][0](np.random.default_rng(7))
     fit = calibrate(pack(views), camera.image_size_px, "radial2", loss=loss)
-    found = judge(fit, covariance(fit))
+    found = judge(fit)
     assert found.word == "ok", found.reasons
 
 

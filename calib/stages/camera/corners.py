@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,6 @@ import cv2
 import numpy as np
 
 from calib.core.arrays import AnyArray, BoolArray, FloatArray, GrayImage
-from calib.core.errors import BadInputError
 from calib.stages.camera.lattice import (
     Lattice,
     checkered,
@@ -369,10 +369,7 @@ def complete(lattice: Lattice) -> FloatArray | None:
 
 
 def _for_opencv(gray: GrayImage) -> Level:
-    n = 1
-    while gray.size / n**2 > _OPENCV_PIXELS:
-        n += 1
-    return resized(gray, 1.0 / n)
+    return resized(gray, 1.0 / max(1, math.ceil(math.sqrt(gray.size / _OPENCV_PIXELS))))
 
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -463,7 +460,7 @@ def _size(grid: Refined) -> tuple[int, int]:
 
 def find_size(gray: GrayImage) -> tuple[int, int] | None:
     """Inner corners (columns, rows), columns >= rows, of the largest board of one picture."""
-    if not _checked(gray):
+    if not _shows_something(gray):
         return None
     for zoom in lattice_levels(gray):
         level = resized(gray, zoom)
@@ -527,13 +524,8 @@ class Detection:
     misfit_px: float
 
 
-def _checked(gray: GrayImage) -> bool:
-    """Whether there is anything to look at. Raises `BadInputError` on what is no grey picture."""
-    if gray.ndim != 2 or gray.dtype != np.uint8:
-        raise BadInputError(
-            f"a picture for the corner search has shape {gray.shape} and type {gray.dtype}; expected two "
-            "dimensions of uint8"
-        )
+def _shows_something(gray: GrayImage) -> bool:
+    """Whether there is anything to look at."""
     return min(gray.shape) >= 8 and int(gray.max()) - int(gray.min()) >= _LEAST_RANGE
 
 
@@ -580,17 +572,8 @@ def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Det
     Returns
     -------
     None where no such board is seen whole, or only as a part of a larger one.
-
-    Raises
-    ------
-    BadInputError
-        On a board of fewer than 3 x 3 corners or a picture that is not (H, W) of uint8.
     """
-    if min(columns, rows) < 3:
-        raise BadInputError(
-            f"a board of {columns}x{rows} inner corners cannot be found; expected at least 3x3"
-        )
-    if not _checked(gray):
+    if not _shows_something(gray):
         return None
     for grids in _candidates(gray, columns, rows, quick):
         grid = _best_of(gray, grids)

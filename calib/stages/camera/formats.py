@@ -107,7 +107,7 @@ def _values(data: object, kind: str) -> FloatArray | None:
 
 
 def _number(value: object) -> float:
-    """A number, NaN for what is none. YAML 1.1 takes some exponents for text."""
+    """A number, NaN for what is none. YAML 1.1 reads 1e-05 as text, and yaml-cpp writes it like that."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
     try:
@@ -126,9 +126,12 @@ def _binary(raw: bytes, kind: str) -> FloatArray | None:
 
 
 def _yaml(text: str) -> object:
-    # OpenCV's directive with its colon is no YAML.
-    text = re.sub(r"\A%YAML:[0-9.]+[^\n]*", "", text)
-    return load(_unescaped(text), _loader())
+    return load(_unescaped(_without_directive(text)), _loader())
+
+
+def _without_directive(text: str) -> str:
+    """The same without OpenCV's directive in the first line, which with its colon is no YAML."""
+    return re.sub(r"\A%YAML:[^\n]*", "", text)
 
 
 def _unescaped(text: str) -> str:
@@ -139,8 +142,6 @@ def _unescaped(text: str) -> str:
 @cache
 def _loader() -> Any:
     """A safe loader that knows OpenCV's matrices."""
-    import yaml
-
     base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     made: Any = type("StorageLoader", (base,), {})
 
@@ -261,13 +262,13 @@ def from_ros(text: str) -> Camera:
             f"distortion_model is {quoted(model)}, expected plumb_bob, rational_polynomial or equidistant; "
             "no other can be expressed"
         )
-    coefficients = _ros_matrix(document, "distortion_coefficients", None)
+    coefficients = _ros_matrix(document, "distortion_coefficients")
     if coefficients.size not in lengths[model]:
         raise BadInputError(
             f"distortion_coefficients.data has {coefficients.size} numbers, expected {lengths[model][-1]} "
             f"for {model}"
         )
-    K = _ros_matrix(document, "camera_matrix", (3, 3))
+    K = _ros_matrix(document, "camera_matrix")
     return _camera(size, K, coefficients.ravel(), "camera_matrix", fisheye=model == "equidistant")
 
 
@@ -303,8 +304,6 @@ def from_opencv(text: str) -> Camera:
     width, height = (_whole(root, key) for key in ("image_width", "image_height"))
     K = _storage_matrix(root, "camera_matrix")
     coefficients = _storage_matrix(root, "distortion_coefficients").ravel()
-    if K.shape != (3, 3):
-        raise BadInputError(f"camera_matrix is {K.shape[0]}x{K.shape[1]}, expected 3x3")
     if coefficients.size not in ((4,) if fisheye else (4, 5, 8, 12, 14)):
         raise BadInputError(
             f"distortion_coefficients has {coefficients.size} numbers, expected "
@@ -369,8 +368,7 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
     if camera.get("camera_model") != "pinhole":
         raise BadInputError(
             f"{entry}.camera_model is {quoted(camera.get('camera_model'))}, expected pinhole; no other can "
-            "be "
-            "expressed"
+            "be expressed"
         )
     model = camera.get("distortion_model")
     if model not in ("radtan", "equidistant", "none"):
@@ -398,6 +396,8 @@ def _camera(
     """The camera, after a look at K and at what it is made of."""
     if min(size) < 1:
         raise BadInputError(f"the image size is {size[0]}x{size[1]}, expected positive numbers")
+    if K.shape != (3, 3):
+        raise BadInputError(f"{key} is {K.shape[0]}x{K.shape[1]}, expected 3x3")
     lower = [K[1, 0], K[2, 0], K[2, 1]]
     if np.abs(lower).max() > _SKEW_LIMIT or K[2, 2] != 1.0 or min(K[0, 0], K[1, 1]) <= 0.0:
         raise BadInputError(f"{key} is not an intrinsic matrix: [fx skew cx; 0 fy cy; 0 0 1] with fx, fy > 0")
@@ -419,12 +419,8 @@ def _matrix(values: FloatArray) -> dict[str, Any]:
 
 
 def _mapping(text: str) -> Mapping[str, Any]:
-    # Some writers put OpenCV's directive, which is no YAML, on the first line.
-    lines = text.split("\n", 1)
-    if lines[0].startswith("%YAML:"):
-        text = "\n" + (lines[1] if len(lines) > 1 else "")
     try:
-        document = load(text)
+        document = load(_without_directive(text))
     except YamlProblem as problem:
         where = "" if problem.line is None else f" at line {problem.line}"
         raise BadInputError(f"not valid YAML{where}: {problem.said}") from problem
@@ -442,34 +438,27 @@ def _whole(document: Mapping[str, Any], key: str) -> int:
     return value
 
 
-def _numbers(values: object, key: str, count: int | None) -> list[float]:
-    """A list of finite numbers. YAML 1.1 reads 1e-05 as text, and yaml-cpp writes it like that."""
+def _numbers(values: object, key: str, count: int) -> list[float]:
+    """A list of finite numbers."""
     if not isinstance(values, Sequence) or isinstance(values, str):
         raise BadInputError(
             f"{key} is missing" if values is None else f"{key} is {quoted(values)}, expected a list"
         )
-    if count is not None and len(values) != count:
+    if len(values) != count:
         raise BadInputError(f"{key} has {len(values)} numbers, expected {count}")
-    numbers = []
-    for value in values:
-        try:
-            number = float(value) if not isinstance(value, bool) else math.nan
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
+    numbers = [_number(value) for value in values]
+    for value, number in zip(values, numbers, strict=True):
         if not math.isfinite(number):
             raise BadInputError(f"{key} contains {quoted(value)}, expected finite numbers")
-        numbers.append(number)
     return numbers
 
 
-def _ros_matrix(document: Mapping[str, Any], key: str, shape: tuple[int, int] | None) -> FloatArray:
+def _ros_matrix(document: Mapping[str, Any], key: str) -> FloatArray:
     node = document.get(key)
     if not isinstance(node, dict):
         raise BadInputError(f"{key} is missing" if node is None else f"{key} has no rows, cols and data")
     rows, cols = _whole(node, "rows"), _whole(node, "cols")
     data = _numbers(node.get("data"), f"{key}.data", rows * cols)
-    if shape is not None and (rows, cols) != shape:
-        raise BadInputError(f"{key} is {rows}x{cols}, expected {shape[0]}x{shape[1]}")
     return np.array(data, dtype=np.float64).reshape(rows, cols)
 
 

@@ -739,7 +739,7 @@ def _by_the_views(fit: Calibration) -> Covariance:
 
 def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:
     try:
-        return judge(fit, covariance(fit), findings)
+        return judge(fit, findings)
     except (np.linalg.LinAlgError, ValueError, IndexError) as error:
         # Points that no camera sees on a flat board leave the checks without a linear system to solve.
         if fit.rms_px < _HOPELESS * max(fit.camera.image_size_px):

@@ -219,8 +219,7 @@ def radial_curve(camera: Camera, r: FloatArray) -> FloatArray:
 
 
 def displacement_field(camera: Camera, pixels: FloatArray) -> FloatArray:
-    """Displacement mu_distorted - mu (..., 2) in pixels at pixels (..., 2) of the undistorted picture "
-    "(B.1)."""
+    """Displacement mu_distorted - mu (..., 2) at pixels (..., 2) of the undistorted picture (B.1), pixels."""
     x, y = np.moveaxis(distorted_normalised(camera, pixels), -1, 0)
     xd, yd = distort(x, y, camera.distortion, camera.fisheye)
     return np.asarray(np.stack([xd - x, yd - y], axis=-1) @ camera.K[:2, :2].T)
@@ -326,7 +325,6 @@ def analyse_distortion(
     *,
     plane: PlaneView | None = None,
     region_px: Region | None = None,
-    tolerance_px: float = 0.01,
 ) -> Lens:
     """The section of a camera's distortion, its evidence the camera: displacement, kind, cost and inverse.
 
@@ -339,7 +337,6 @@ def analyse_distortion(
     camera_covariance : (13, 13) in the order of `projection.INTRINSICS`, or None.
     region_px : region of interest; by default the box around the plane's workspace in the picture,
         without a plane `central_region`.
-    tolerance_px : of the inverse polynomial.
 
     Raises
     ------
@@ -372,7 +369,7 @@ def analyse_distortion(
         monotonic=one_to_one_reach(camera) > 1.0,
         region_sigma_px=None if sigma is None else float(sigma.min()),
         **cost,
-        inverse=fit_inverse(camera, tolerance_px),
+        inverse=fit_inverse(camera),
         effect=effect,
         verdict="ok",
         remarks=[why],

@@ -84,14 +84,12 @@ class Disc:
     ----------
     centre_px : (2,) centre of the ellipse. sigma_px : standard deviation of one coordinate, from the edges.
     axes_px : (2,) half axes. box_px : left, top, right, bottom of the coloured pixels, inclusive.
-    roughness : scatter of the edges about the ellipse over the radius.
     """
 
     centre_px: FloatArray
     sigma_px: float
     axes_px: FloatArray
     box_px: tuple[int, int, int, int]
-    roughness: float
 
     @property
     def radius_px(self) -> float:
@@ -202,13 +200,10 @@ def measured(bgr: AnyArray, middle_px: FloatArray, radius_px: float, colour: Col
     axes = np.sort(ellipse.axes_px)
     if ellipse.share < _LEAST_RAYS or axes[0] < _ROUND * axes[1]:
         return None
-    roughness = ellipse.scatter_px / radius
-    if radius < 1.5 or roughness > max(_ROUGH_SHARE, 0.4 / radius):
+    if radius < 1.5 or ellipse.scatter_px / radius > max(_ROUGH_SHARE, 0.4 / radius):
         return None
     box = _box(bgr, ellipse, colour)
-    if box is None:
-        return None
-    return Disc(centre, ellipse.sigma_px, ellipse.axes_px, box, roughness)
+    return None if box is None else Disc(centre, ellipse.sigma_px, ellipse.axes_px, box)
 
 
 def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray, BoolArray] | None:

@@ -186,18 +186,6 @@ class Comparison:
     inflation: float
 
 
-def refuse_unusable(views: Sequence[View]) -> None:
-    """Raise BadInputError for points from which no plane can be computed."""
-    world = np.unique(np.round(np.concatenate([view.target_m for view in views]), 9), axis=0)
-    if len(world) < 4:
-        raise BadInputError(f"a plane needs at least 4 different corners, got {len(world)}")
-    spread = np.linalg.svd(world - world.mean(axis=0), compute_uv=False)
-    if spread[1] < 1e-6 * spread[0]:
-        raise BadInputError(
-            "all corners of the plane lie on one line; a plane needs corners on both sides of it"
-        )
-
-
 def compare_pictures(
     camera: Camera, views: Sequence[View], pose: Pose
 ) -> tuple[tuple[PictureFit, ...], Comparison]:
@@ -229,7 +217,6 @@ def compare_pictures(
 
 def _own_pose(camera: Camera, view: View) -> Pose | None:
     try:
-        refuse_unusable([view])
         return fit_pose(camera, view.target_m, view.pixels)
     except BadInputError:
         return None
@@ -475,10 +462,8 @@ def calibrate_plane(
     Raises
     ------
     BadInputError
-        With fewer than four different points, points on a line, numbers that are not finite, or a
-        mirrored plane.
+        With points on a line, or a mirrored plane.
     """
-    refuse_unusable(views)
     world_m = np.concatenate([view.target_m for view in views])
     pixels = np.concatenate([view.pixels for view in views])
     groups = _same_points(world_m)
@@ -653,16 +638,15 @@ def settle_orientation(
     if off[order[1]] - off[best] < 2 * _UNDECIDED_DEG:
         raise BadInputError(
             f"{name}: the world's x axis would point {degrees:.1f} or "
-            f"{_wrapped_deg(directions[int(order[1])]):.1f} degrees "
-            "from the picture's right, so the first corner cannot be told; give first_corner_px: [u, v] in "
-            "board.yaml"
+            f"{_wrapped_deg(directions[int(order[1])]):.1f} degrees from the picture's right, so the first "
+            "corner cannot be told; give first_corner_px: [u, v] in board.yaml"
         )
     limit = 90 if len(candidates) == 2 else 45
     looks = "looks the same after a quarter turn" if limit == 45 else "can be read from either end"
     how = (
         f"The board {looks}; corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), so "
-        "that the world's "
-        f"x axis points {_words(degrees)} in the picture (rule: right to within {limit} degrees)."
+        f"that the world's x axis points {_words(degrees)} in the picture (rule: right to within {limit} "
+        "degrees)."
     )
     return Placement(chosen, turn, degrees, how)
 
@@ -689,14 +673,12 @@ def _settle_by_pixel(
         seen = ", ".join(f"({turned[0, 0]:.1f}, {turned[0, 1]:.1f})" for _, turned in candidates)
         raise BadInputError(
             f"{name}: first_corner_px is [{wanted[0]:g}, {wanted[1]:g}], but the corners that can be the "
-            "first are seen at "
-            f"{seen}; expected one within half a square ({limit:.1f} px)"
+            f"first are seen at {seen}; expected one within half a square ({limit:.1f} px)"
         )
     degrees = _wrapped_deg(_world_x_direction(chosen, board, angle_rad))
     how = (
         f"Corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), {distances[best]:.1f} "
-        "px from "
-        f"first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right "
+        f"px from first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right "
         "(positive is down)."
     )
     return Placement(chosen, turn, degrees, how)

@@ -387,10 +387,7 @@ class _Search:
         columns, rows = layout.columns - 1, layout.rows - 1
         stated = next((c for c in (corners, corners[::-1]) if c[0] == columns and c[1] >= rows), None)
         if stated is None:
-            raise BadInputError(
-                f"{_names(self.pictures)}: no board with {corners[0]}x{corners[1]} inner corners found in "
-                f"{_count(len(self.pictures))}, but a ChArUco board with {columns}x{rows} was"
-            )
+            raise BadInputError(_not_found(self.pictures, corners, (columns, rows), "a ChArUco board"))
         return replace(layout, rows=stated[1] + 1)
 
     def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
@@ -416,8 +413,10 @@ class _Search:
         return None if most is None or counts[most] < share * len(which) else most
 
 
-def _not_found(pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None) -> str:
-    instead = "and no other either" if other is None else f"but one with {other[0]}x{other[1]} was"
+def _not_found(
+    pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None, what: str = "one"
+) -> str:
+    instead = "and no other either" if other is None else f"but {what} with {other[0]}x{other[1]} was"
     return (
         f"{_names(pictures)}: no board with {wanted[0]}x{wanted[1]} inner corners found in "
         f"{_count(len(pictures))}, {instead}"
@@ -672,9 +671,8 @@ def _legend(names: list[str], path: Path, line: int) -> list[str]:
     for name in ("filename", "x", "y"):
         if names.count(name) != 1:
             raise BadInputError(
-                f"{shown(path)}: line {line}: the legend is {' '.join(names)[:80]!r}, expected '# filename x "
-                "y "
-                "level'"
+                f"{shown(path)}: line {line}: the legend is {' '.join(names)[:80]!r}, expected "
+                "'# filename x y level'"
             )
     return names
 
@@ -698,8 +696,7 @@ def _view(name: str, found: list[tuple[int, float, float]], board: Board, path: 
     if len(found) != board.corners:
         raise BadInputError(
             f"{shown(path)}: line {found[0][0]}: {shown(name)} has {len(found)} corners, expected "
-            f"{board.columns}x{board.rows} = "
-            f"{board.corners}"
+            f"{board.columns}x{board.rows} = {board.corners}"
         )
     if seen.sum() < _FEWEST:
         raise BadInputError(

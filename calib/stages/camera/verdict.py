@@ -168,10 +168,7 @@ def _of_solution(calibration: Calibration) -> Iterator[Finding]:
     """Enough views and points, and a solver that arrived."""
     views, points = calibration.observations.views, calibration.observations.points
     short = calibration.decrement
-    if calibration.termination == "behind the camera":
-        text = "No camera was found that has all points of the board in front of it."
-        yield Finding("unidentifiable", text)
-    elif calibration.termination == "singular":
+    if calibration.termination == "singular":
         text = (
             "The normal equations are singular: the views leave a direction of the parameters entirely free."
         )
@@ -217,8 +214,8 @@ def _of_lens(calibration: Calibration) -> Iterator[Finding]:
         text = (
             f"The lens model is one-to-one up to {100 * found.reach:.0f} % of the way to the picture's "
             f"corners only ({100 * ONE_TO_ONE_REACH:.0f} is good; points were seen "
-            f"{100 * _radius_share(calibration):.0f} % of "
-            f"the way); {100 * (1 - found.image_shown):.0f} % of the picture's border cannot be undistorted."
+            f"{100 * _radius_share(calibration):.0f} % of the way); "
+            f"{100 * (1 - found.image_shown):.0f} % of the picture's border cannot be undistorted."
         )
         inside = found.reach <= 1.0 or found.image_shown < 1.0
         yield Finding("poor" if inside else "remark", text, _IN_CORNERS)
@@ -701,21 +698,18 @@ _LEFT_OUT_WEIGHT = 0.5
 """Points that a robust loss weighs less are left out of the checks."""
 
 
-def judge(
-    calibration: Calibration, found: Covariance | None = None, findings: Sequence[Finding] = ()
-) -> Verdict:
+def judge(calibration: Calibration, findings: Sequence[Finding] = ()) -> Verdict:
     """Judge a calibration by its views alone.
 
     Parameters
     ----------
-    found : its covariance, where it is at hand.
     findings : what is there to say already, as of views that were left out.
     """
     faulty, sturdy = list(of_faults(calibration.observations)), None
     every = [*findings, *faulty]
     if all(one.severity != "inconsistent" for one in faulty):
         # Else what is wrong follows from the views that are none.
-        more, sturdy = _by_the_rules(calibration, found)
+        more, sturdy = _by_the_rules(calibration)
         every += more
     if any(one.advice == _IN_CORNERS for one in every):
         # Which says the same and more.
@@ -727,9 +721,7 @@ def judge(
     return Verdict.of([*every, *_next_picture(sturdy, verdict)])
 
 
-def _by_the_rules(
-    calibration: Calibration, found: Covariance | None
-) -> tuple[list[Finding], Calibration | None]:
+def _by_the_rules(calibration: Calibration) -> tuple[list[Finding], Calibration | None]:
     """What the rules find, and the `conditioned` fit where there is one that more views can improve."""
     findings = list(_of_solution(calibration))
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
@@ -748,7 +740,7 @@ def _by_the_rules(
     share = _focal_share(sturdy, known)
     if calibration.basis is not None:
         # A target that was deformed to fit costs certainty, which the rigid target in its shape hides.
-        share = max(share, _focal_share(calibration, covariance(calibration) if found is None else found))
+        share = max(share, _focal_share(calibration, covariance(calibration)))
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
