@@ -29,12 +29,12 @@ from calib.stages.camera.plane import (
     compare_pictures,
     position_sigma,
     settle_orientation,
-    to_pixels,
     world_points_m,
 )
 from calib.stages.camera.pose import (
     fit_pose,
     plane_map,
+    plane_pixels,
     pose_derivatives,
     projection_with_derivatives,
 )
@@ -91,7 +91,7 @@ def test_there_and_back_is_exact(camera: Camera) -> None:
     plane = calibrate_plane(camera, None, [picture(camera, 0.2)])
     x, y = np.meshgrid(np.linspace(-0.07, 0.07, 15), np.linspace(0.0, 0.1, 11))
     world = np.stack([x, y], axis=-1)
-    pixels = to_pixels(plane, camera, world)
+    pixels = plane_pixels(camera, plane.R_CW, plane.t_CW_m, world)
     assert pixels.shape == world.shape
     assert np.abs(plane_map(camera, plane.R_CW, plane.t_CW_m, pixels) - world).max() < 1e-12
 

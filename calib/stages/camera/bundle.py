@@ -280,18 +280,9 @@ def homographies(observations: Observations) -> FloatArray:
 
 def _constraint(H: FloatArray, i: int, j: int) -> FloatArray:
     """Row v_ij of Zhang's system, (N, 6): h_i^T B h_j = v_ij . (B11, B12, B22, B13, B23, B33)."""
-    a, b = H[:, :, i], H[:, :, j]
-    return np.stack(
-        [
-            a[:, 0] * b[:, 0],
-            a[:, 0] * b[:, 1] + a[:, 1] * b[:, 0],
-            a[:, 1] * b[:, 1],
-            a[:, 2] * b[:, 0] + a[:, 0] * b[:, 2],
-            a[:, 2] * b[:, 1] + a[:, 1] * b[:, 2],
-            a[:, 2] * b[:, 2],
-        ],
-        axis=1,
-    )
+    product = H[:, :, None, i] * H[:, None, :, j]
+    both = product + product.transpose(0, 2, 1)
+    return np.asarray(both[:, [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] * [0.5, 1.0, 0.5, 1.0, 1.0, 0.5])
 
 
 def closed_form_intrinsics(H: FloatArray, image_size_px: tuple[int, int], unknowns: str) -> FloatArray | None:

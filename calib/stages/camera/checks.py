@@ -493,10 +493,8 @@ class TargetShape:
 
 def _basis(calibration: Calibration) -> tuple[FloatArray, float]:
     """Displacements (5, 3, M) or (N, 5, 3, M) of the points, and half the target's longer side."""
-    target = calibration.observations.target_m
-    present = np.broadcast_to(calibration.observations.present, calibration.observations.pixels.shape[:2])
-    used = np.broadcast_to(target, (*present.shape, 3))[present]
-    low, high = used[:, :2].min(axis=0), used[:, :2].max(axis=0)
+    target, box = calibration.observations.target_m, target_box(calibration)
+    low, high = box[0, :2], box[2, :2]
     half = 0.5 * float((high - low).max())
     x, y = np.moveaxis(target[..., :2] - 0.5 * (low + high), 2, 0)
     basis = np.zeros((target.shape[0], 5, 3, target.shape[1]))
@@ -943,14 +941,10 @@ def best_split(calibration: Calibration) -> Split | None:
     statistics = np.minimum(statistics, _sturdy(problem, lambda one: search(one, 6, 2)[1]))
     # Of few divisions less is reached by chance.
     ordered = bool(statistics[1] / chances[1] > _IN_ORDER * statistics[0] / chances[0])
-    best, statistic, chance = (
-        divisions[ordered],
-        float(statistics[int(ordered)]),
-        float(chances[int(ordered)]),
-    )
+    best, k = divisions[ordered], int(ordered)
     if not ordered and best.sum() > len(best) / 2:
         best = ~best
-    return _described(problem, scale, calibration, best, statistic, chance)
+    return _described(problem, scale, calibration, best, float(statistics[k]), float(chances[k]))
 
 
 # ----------------------------------------------------------------------

@@ -30,7 +30,7 @@ from calib.stages.camera.model import (
     vector_from_camera,
 )
 from calib.stages.camera.plane import visible
-from calib.stages.camera.pose import projection_with_derivatives
+from calib.stages.camera.pose import plane_pixels, projection_with_derivatives
 from calib.stages.camera.section import InverseLens, Lens
 
 # ----------------------------------------------------------------------
@@ -120,10 +120,8 @@ def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InverseLens:
     width, height = camera.image_size_px
     pixels = pixel_grid(camera.image_size_px, (-0.5, -0.5, width - 0.5, height - 0.5)).reshape(-1, 2)
     ideal, seen = exact_inverse(camera, pixels)
-    best, least = (
-        InverseLens(radial=[], decentering_steps=0, max_error_px=None, covered=float(np.mean(seen))),
-        np.inf,
-    )
+    covered, least = float(np.mean(seen)), np.inf
+    best = InverseLens(radial=[], decentering_steps=0, max_error_px=None, covered=covered)
     if not seen.any():
         return best
     ideal = ideal[seen]
@@ -398,13 +396,14 @@ def _on_plane(camera: Camera, plane: PlaneView) -> tuple[dict[str, Any], Region 
     points = points[visible(camera, plane.R_CW, plane.t_CW_m, points)]
     if len(points) < 4 or np.linalg.matrix_rank(points - points.mean(axis=0)) < 2:
         return {}, None
-    H = np.column_stack([plane.R_CW[:, :2], plane.t_CW_m])
-    pixels = project(camera, np.column_stack([points, np.ones(len(points))]) @ H.T)
-    unaware = apply_homography(np.asarray(np.linalg.inv(camera.K @ H), dtype=np.float64), pixels)
-    error_mm = 1e3 * np.linalg.norm(unaware - points, axis=1)
-    fitted = fit_homography(points, pixels).H
-    refitted = apply_homography(np.asarray(np.linalg.inv(fitted), dtype=np.float64), pixels)
-    refitted_mm = 1e3 * np.linalg.norm(refitted - points, axis=1)
+    pixels = plane_pixels(camera, plane.R_CW, plane.t_CW_m, points)
+    error_mm, refitted_mm = (
+        1e3 * np.linalg.norm(apply_homography(np.asarray(np.linalg.inv(H)), pixels) - points, axis=1)
+        for H in (
+            camera.K @ np.column_stack([plane.R_CW[:, :2], plane.t_CW_m]),
+            fit_homography(points, pixels).H,
+        )
+    )
     size = np.array(camera.image_size_px) - 1.0
     u0, v0 = np.maximum(pixels.min(axis=0), 0.0)
     u1, v1 = np.minimum(pixels.max(axis=0), size)

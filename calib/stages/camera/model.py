@@ -299,14 +299,21 @@ def angle_curve(theta: AnyArray, distortion: FloatArray) -> tuple[AnyArray, AnyA
     return theta_d, 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
 
 
+def _by_angle(
+    x: FloatArray, y: FloatArray, z: FloatArray, distortion: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Distorted normalised coordinates of points in a fisheye lens's frame, any shape."""
+    rho = np.maximum(np.hypot(x, y), _SMALL * np.abs(z))
+    scale = angle_curve(np.arctan2(rho, z), distortion)[0] / rho
+    return x * scale, y * scale
+
+
 def distort(
     x: FloatArray, y: FloatArray, distortion: FloatArray, fisheye: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Distorted from undistorted normalised coordinates, any shape."""
     if fisheye:
-        r = np.maximum(np.hypot(x, y), _SMALL)
-        scale = angle_curve(np.arctan(r), distortion)[0] / r
-        return x * scale, y * scale
+        return _by_angle(x, y, np.ones_like(x), distortion)
     k1, k2, p1, p2, k3, k4, k5, k6 = distortion
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -327,14 +334,11 @@ def project(camera: Camera, points_C: FloatArray) -> FloatArray:
     -------
     (..., 2) distorted pixels.
     """
+    x, y, z = np.moveaxis(points_C, -1, 0)
     if camera.fisheye:
-        rho = np.maximum(np.hypot(points_C[..., 0], points_C[..., 1]), _SMALL * np.abs(points_C[..., 2]))
-        scale = angle_curve(np.arctan2(rho, points_C[..., 2]), camera.distortion)[0] / rho
-        xd, yd = points_C[..., 0] * scale, points_C[..., 1] * scale
+        xd, yd = _by_angle(x, y, z, camera.distortion)
     else:
-        x = points_C[..., 0] / points_C[..., 2]
-        y = points_C[..., 1] / points_C[..., 2]
-        xd, yd = distort(x, y, camera.distortion)
+        xd, yd = distort(x / z, y / z, camera.distortion)
     u = camera.fx_px * xd + camera.skew_px * yd + camera.cx_px
     v = camera.fy_px * yd + camera.cy_px
     return np.stack([u, v], axis=-1)

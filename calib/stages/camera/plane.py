@@ -14,7 +14,7 @@ from calib.core.geometry import Homography, apply_homography, fit_homography, ma
 from calib.core.verdict import Finding, Verdict
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.model import Board, Camera, View, box_grid, project, undistort
-from calib.stages.camera.pose import Pose, fit_pose, plane_map, pose_derivatives
+from calib.stages.camera.pose import Pose, fit_pose, plane_map, plane_pixels, pose_derivatives
 
 # ----------------------------------------------------------------------
 # Standard deviation of a marker's position on the plane, from all that is uncertain.
@@ -70,19 +70,11 @@ class PositionSigma:
 
 def visible(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, points_m: FloatArray) -> BoolArray:
     """Which places (N, 2) of the plane the picture shows, (N,): in front, inside, and not folded over."""
-    shown = np.asarray(points_m @ R_CW[2, :2] + t_CW_m[2] > 0.0)
-    if not shown.any():
-        return shown
-    pixels = pose_derivatives(camera, R_CW, t_CW_m, points_m[shown])[0]
-    width, height = camera.image_size_px
-    inside = np.all((pixels >= -0.5) & (pixels <= np.array([width, height]) - 0.5), axis=1)
-    back = np.full(pixels.shape, np.nan)
-    back[inside] = plane_map(camera, R_CW, t_CW_m, pixels[inside])
-    size = np.linalg.norm(t_CW_m)
-    result = shown.copy()
-    returned = np.linalg.norm(back - points_m[shown], axis=1)
-    result[shown] = returned < 1e-6 * size
-    return result
+    pixels = plane_pixels(camera, R_CW, t_CW_m, points_m)
+    shown = np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size_px) - 0.5), axis=1))
+    back = plane_map(camera, R_CW, t_CW_m, pixels[shown])
+    shown[shown] = np.linalg.norm(back - points_m[shown], axis=1) < 1e-6 * np.linalg.norm(t_CW_m)
+    return shown
 
 
 def position_sigma(
@@ -370,7 +362,7 @@ def _of_precision(
     if pose.other is not None:
         cost, R, t = pose.other
         points = sigma.points_m[seen]
-        pixels = to_pixels(pose, camera, points)
+        pixels = plane_pixels(camera, pose.R_CW, pose.t_CW_m, points)
         apart = 1e3 * np.linalg.norm(plane_map(camera, R, t, pixels) - points, axis=1)
         likely = cost - pose.cost_px2 < 9.0 * pose.sigma_px**2
         if likely and np.nanmax(apart) > 3.0 * float(np.hypot(*calibration_mm.T).max()):
@@ -430,14 +422,6 @@ class Plane(Pose):
     def A_inverse(self) -> FloatArray:
         """A^-1 of (2.11), (3, 3), ideal pixels to metres."""
         return np.asarray(np.linalg.inv(self.A), dtype=np.float64)
-
-
-def to_pixels(pose: Pose, camera: Camera, world_m: FloatArray) -> FloatArray:
-    """Distorted pixels (..., 2) of world positions (..., 2), NaN behind the camera."""
-    points_C = world_m @ pose.R_CW[:, :2].T + pose.t_CW_m
-    front = points_C[..., 2] > 0.0
-    points_C = np.where(front[..., None], points_C, 1.0)
-    return np.where(front[..., None], project(camera, points_C), np.nan)
 
 
 def calibrate_plane(
@@ -516,8 +500,8 @@ def moved_m(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray
     """How far the map without a lens moves the marker at each of places (..., 2); NaN out of sight."""
     seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m.reshape(-1, 2)).reshape(points_m.shape[:-1])
     moved = np.full(points_m.shape, np.nan)
-    without = np.asarray(np.linalg.inv(direct.H), dtype=np.float64)
-    moved[seen] = apply_homography(without, to_pixels(pose, camera, points_m[seen])) - points_m[seen]
+    pixels = plane_pixels(camera, pose.R_CW, pose.t_CW_m, points_m[seen])
+    moved[seen] = apply_homography(np.asarray(np.linalg.inv(direct.H)), pixels) - points_m[seen]
     return moved
 
 

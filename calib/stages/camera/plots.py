@@ -51,7 +51,8 @@ from calib.stages.camera.lens import (
     shown_once,
 )
 from calib.stages.camera.model import Camera, box_grid, focal_px, fold_radius, vector_from_camera
-from calib.stages.camera.plane import Plane, moved_m, to_pixels
+from calib.stages.camera.plane import Plane, moved_m
+from calib.stages.camera.pose import plane_pixels
 from calib.stages.camera.section import Lens
 
 Size = tuple[int, int]
@@ -661,7 +662,7 @@ def _pixels(camera: Camera, plane: Plane, world_m: FloatArray) -> FloatArray:
     """Pixels (n, 2) of places on the plane, NaN behind the camera and beyond the lens model's fold."""
     x, y, z = (world_m @ plane.R_CW[:, :2].T + plane.t_CW_m).T
     kept = (z > 0.0) & (np.hypot(x, y) < fold_radius(camera)[0] * np.where(z > 0.0, z, 1.0))
-    return np.where(kept[:, None], to_pixels(plane, camera, world_m), np.nan)
+    return np.where(kept[:, None], plane_pixels(camera, plane.R_CW, plane.t_CW_m, world_m), np.nan)
 
 
 def _outline(camera: Camera, plane: Plane) -> list[Mark]:

@@ -21,7 +21,15 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, fit_homography, grouped_variance
 from calib.stages.camera.bundle import linearise, minimise
-from calib.stages.camera.model import INTRINSICS, Block, Camera, Observations, point_derivatives, undistort
+from calib.stages.camera.model import (
+    INTRINSICS,
+    Block,
+    Camera,
+    Observations,
+    point_derivatives,
+    project,
+    undistort,
+)
 
 _EVERY_INTRINSIC = np.arange(len(INTRINSICS))
 _TOLERANCE = 1e-9
@@ -166,3 +174,10 @@ def plane_map(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, pixels: Floa
     """World points (..., 2) seen at distorted pixels (..., 2), NaN beyond the horizon or the lens's fold."""
     A = np.column_stack([R_CW[:, :2], t_CW_m])
     return apply_homography(np.linalg.inv(A), undistort(camera, pixels))
+
+
+def plane_pixels(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, world_m: FloatArray) -> FloatArray:
+    """The inverse of `plane_map`: distorted pixels of world points (..., 2), NaN behind the camera."""
+    points_C = world_m @ R_CW[:, :2].T + t_CW_m
+    front = points_C[..., 2:] > 0.0
+    return np.where(front, project(camera, np.where(front, points_C, 1.0)), np.nan)
