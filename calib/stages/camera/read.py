@@ -463,6 +463,10 @@ _FEWEST = 4
 _LONGEST_LINE = 65536
 
 
+def _at(path: Path, line: int, what: str) -> BadInputError:
+    return BadInputError(f"{shown(path)}: line {line}: {what}")
+
+
 @dataclass
 class _Points:
     """What was read of one view so far: four numbers a row, and the lines; compact, for long tables."""
@@ -484,10 +488,9 @@ class _Points:
         if len(again):
             second = int(again[0])
             x, y = rows[second, :2]
-            raise BadInputError(
-                f"{shown(path)}: line {self.lines[second]}: the point x_m = {x:g}, y_m = {y:g} of {where} "
-                f"was given in line {self.lines[int(first[index.ravel()[second]])]}"
-            )
+            before = self.lines[int(first[index.ravel()[second]])]
+            what = f"the point x_m = {x:g}, y_m = {y:g} of {where} was given in line {before}"
+            raise _at(path, self.lines[second], what)
         return View(name, rows[:, :2].copy(), rows[:, 2:].copy())
 
 
@@ -530,7 +533,7 @@ def _number(text: str, path: Path, line: int, column: str) -> float:
     if value is not None and math.isfinite(value):
         return value
     found = "empty" if not word else repr(word[:40])
-    raise BadInputError(f"{shown(path)}: line {line}: {column} is {found}, expected a finite number")
+    raise _at(path, line, f"{column} is {found}, expected a finite number")
 
 
 def _numbers(text: str, cells: list[str], path: Path, line: int) -> list[float]:
@@ -550,9 +553,7 @@ def _cells(text: str, path: Path, line: int) -> list[str]:
     try:
         return next(csv.reader([text], strict=True, skipinitialspace=True), [])
     except csv.Error as error:
-        raise BadInputError(
-            f"{shown(path)}: line {line}: not a line of comma-separated values ({error})"
-        ) from error
+        raise _at(path, line, f"not a line of comma-separated values ({error})") from error
 
 
 def _header(cells: list[str], path: Path, line: int) -> list[int]:
@@ -561,13 +562,11 @@ def _header(cells: list[str], path: Path, line: int) -> list[int]:
     missing = [name for name in COLUMNS if name not in names]
     if missing:
         found = ",".join(names)[:80]
-        raise BadInputError(
-            f"{shown(path)}: line {line}: the header lacks {', '.join(missing)}; "
-            f"expected {','.join(COLUMNS)} separated by commas, found {found!r}"
-        )
+        expected = f"{','.join(COLUMNS)} separated by commas"
+        raise _at(path, line, f"the header lacks {', '.join(missing)}; expected {expected}, found {found!r}")
     for name in COLUMNS:
         if names.count(name) > 1:
-            raise BadInputError(f"{shown(path)}: line {line}: the header has {name} more than once")
+            raise _at(path, line, f"the header has {name} more than once")
     return [names.index(name) for name in COLUMNS]
 
 
@@ -594,12 +593,10 @@ def read_table(path: Path) -> list[View]:
             where, width = _header(cells, path, line), len(cells)
             continue
         if len(cells) != width:
-            raise BadInputError(
-                f"{shown(path)}: line {line}: has {len(cells)} values, expected {width} as in the header"
-            )
+            raise _at(path, line, f"has {len(cells)} values, expected {width} as in the header")
         name = cells[where[0]].strip()
         if not name:
-            raise BadInputError(f"{shown(path)}: line {line}: view is empty, expected a name")
+            raise _at(path, line, "view is empty, expected a name")
         points = views.get(name)
         if points is None:
             points = views[name] = _Points()
@@ -646,16 +643,11 @@ def read_vnl(path: Path, columns: int, rows: int, square_m: float) -> list[View]
         if not words:
             continue
         if not legend:
-            raise BadInputError(
-                f"{shown(path)}: line {line}: no legend before the data, expected '# filename x y level'"
-            )
+            raise _at(path, line, "no legend before the data, expected '# filename x y level'")
         row = dict(zip(legend, words, strict=False))
         # mrgingham leaves the level out where it found no board.
         if not {"filename", "x", "y"} <= row.keys() or len(words) > len(legend):
-            raise BadInputError(
-                f"{shown(path)}: line {line}: has {len(words)} values, expected {len(legend)} as in the "
-                "legend"
-            )
+            raise _at(path, line, f"has {len(words)} values, expected {len(legend)} as in the legend")
         pictures.setdefault(row["filename"], []).append((line, *_corner(row, path, line)))
     if not legend:
         raise BadInputError(
@@ -670,10 +662,8 @@ def read_vnl(path: Path, columns: int, rows: int, square_m: float) -> list[View]
 def _legend(names: list[str], path: Path, line: int) -> list[str]:
     for name in ("filename", "x", "y"):
         if names.count(name) != 1:
-            raise BadInputError(
-                f"{shown(path)}: line {line}: the legend is {' '.join(names)[:80]!r}, expected "
-                "'# filename x y level'"
-            )
+            found = " ".join(names)[:80]
+            raise _at(path, line, f"the legend is {found!r}, expected '# filename x y level'")
     return names
 
 
@@ -693,16 +683,13 @@ def _view(name: str, found: list[tuple[int, float, float]], board: Board, path: 
     seen = np.isfinite(pixels[:, 0])
     if not seen.any() and len(found) in (1, board.corners):
         return None
+    line, has = found[0][0], f"{shown(name)} has"
     if len(found) != board.corners:
-        raise BadInputError(
-            f"{shown(path)}: line {found[0][0]}: {shown(name)} has {len(found)} corners, expected "
-            f"{board.columns}x{board.rows} = {board.corners}"
-        )
+        expected = f"{board.columns}x{board.rows} = {board.corners}"
+        raise _at(path, line, f"{has} {len(found)} corners, expected {expected}")
     if seen.sum() < _FEWEST:
-        raise BadInputError(
-            f"{shown(path)}: line {found[0][0]}: {shown(name)} has {int(seen.sum())} corners that were seen, "
-            f"expected at least {_FEWEST}"
-        )
+        what = f"{has} {int(seen.sum())} corners that were seen, expected at least {_FEWEST}"
+        raise _at(path, line, what)
     target = board.points_m()
     if _mirrored(target[seen], pixels[seen]):
         pixels = pixels.reshape(board.rows, board.columns, 2)[:, ::-1].reshape(-1, 2)
