@@ -62,7 +62,7 @@ def live(
     from calib.live.album import Album
     from calib.live.session import Session
     from calib.live.sources import source_of
-    from calib.stages.camera.read import Told
+    from calib.stages.camera.options import Told
 
     try:
         from calib.live.server import Live

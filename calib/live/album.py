@@ -18,7 +18,8 @@ from calib.core.writing import RIG_FILE, Kind, begins, make_folder, move, write_
 from calib.io.pictures import holds_pictures, list_pictures
 from calib.stages import stage
 from calib.stages.camera.model import View
-from calib.stages.camera.read import BOARD_FILE, BoardFile, Told, read_board_file, read_views
+from calib.stages.camera.options import Told
+from calib.stages.camera.read import BOARD_FILE, BoardFile, read_board_file, read_views
 
 if TYPE_CHECKING:
     from calib.stages.camera.section import Camera, Plane

@@ -38,7 +38,6 @@ from calib.stages.camera.checks import (
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import (
     Candidate,
-    Choices,
     Intrinsics,
     LensModel,
     board_basis,
@@ -66,7 +65,8 @@ from calib.stages.camera.model import (
     undistort,
     vector_from_camera,
 )
-from calib.stages.camera.read import Told, read_views
+from calib.stages.camera.options import Choices, Told
+from calib.stages.camera.read import read_views
 from calib.twin.pictures import BOARD as TWIN_BOARD
 from calib.twin.pictures import CAMERA as SHIPPED
 from calib.twin.pictures import shots

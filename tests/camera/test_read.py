@@ -12,7 +12,8 @@ from calib.core import workers
 from calib.core.errors import BadInputError
 from calib.stages.camera import read as boards
 from calib.stages.camera.model import Board
-from calib.stages.camera.read import Told, board_of, find_boards, read_table, read_views, read_vnl
+from calib.stages.camera.options import Told
+from calib.stages.camera.read import board_of, find_boards, read_table, read_views, read_vnl
 
 HEADER = "view,x_m,y_m,u_px,v_px\n"
 FOUR = "a,0,0,10,10\na,0.02,0,20,10\na,0,0.02,10,20\na,0.02,0.02,20.5,21\n"

@@ -76,7 +76,8 @@ def test_nothing_has_markers_that_has_none(project_root: Path) -> None:
 
 def test_public_pictures_are_fitted_better_than_by_opencv(shared_data: Path) -> None:
     """17 photographs of a screen; OpenCV's detector with its best marker length, its calibration 5 + 4."""
-    from calib.stages.camera.intrinsics import Choices, calibrate_camera
+    from calib.stages.camera.intrinsics import calibrate_camera
+    from calib.stages.camera.options import Choices
 
     paths = list_pictures([shared_data / "pv_charuco"])
     found = find_boards(paths, None, 1.0)

@@ -15,8 +15,9 @@ from calib.io.pictures import list_pictures, read_picture, usual_size
 from calib.stages.camera.bundle import calibrate, covariance, refitted
 from calib.stages.camera.checks import evidence, overdispersion
 from calib.stages.camera.corners import detect
-from calib.stages.camera.intrinsics import Choices, Intrinsics, calibrate_camera
+from calib.stages.camera.intrinsics import Intrinsics, calibrate_camera
 from calib.stages.camera.model import Board, Camera, View, pack
+from calib.stages.camera.options import Choices
 from calib.stages.camera.pose import fit_pose
 from calib.stages.camera.triage import agreement, triage, turned_views
 from calib.twin.scene import Pose, PrintedBoard, render

@@ -29,7 +29,7 @@ from calib.stages.camera.checks import (
     widened,
 )
 from calib.stages.camera.corners import detect
-from calib.stages.camera.intrinsics import Choices, calibrate_camera, without_copies
+from calib.stages.camera.intrinsics import calibrate_camera, without_copies
 from calib.stages.camera.model import (
     MODELS,
     Board,
@@ -41,6 +41,7 @@ from calib.stages.camera.model import (
     project,
     vector_from_camera,
 )
+from calib.stages.camera.options import Choices
 from calib.stages.camera.pose import fit_pose
 from calib.stages.camera.verdict import judge, of_leaving
 from calib.twin.pictures import BOARD, CAMERA

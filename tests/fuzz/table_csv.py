@@ -17,7 +17,8 @@ def check(data: bytes, folder: Path) -> None:
     """Views of finite numbers with four points at least, each once, inside the picture."""
     import numpy as np
 
-    from calib.stages.camera.read import Told, read_table, read_views
+    from calib.stages.camera.options import Told
+    from calib.stages.camera.read import read_table, read_views
 
     path = folder / "points.csv"
     path.write_bytes(data)

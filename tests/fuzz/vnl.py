@@ -18,7 +18,8 @@ def check(data: bytes, folder: Path) -> None:
     """Views of at most the board's corners, all finite."""
     import numpy as np
 
-    from calib.stages.camera.read import Told, read_views, read_vnl
+    from calib.stages.camera.options import Told
+    from calib.stages.camera.read import read_views, read_vnl
 
     path = folder / "corners.vnl"
     path.write_bytes(data)
@@ -27,7 +28,7 @@ def check(data: bytes, folder: Path) -> None:
     for view in views:
         assert 4 <= len(view.pixels) == len(view.target_m) <= 9
         assert np.isfinite(view.pixels).all() and np.isfinite(view.target_m).all()
-    read_views([path], Told((3, 3), None, (640, 480)))
+    read_views([path], Told((3, 3), image_size_px=(640, 480)))
 
 
 if __name__ == "__main__":

@@ -39,7 +39,8 @@ from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
 from calib.stages.camera.intrinsics import calibrate_camera
 from calib.stages.camera.model import View, box_grid, pack
-from calib.stages.camera.read import BoardFile, Told
+from calib.stages.camera.options import Told
+from calib.stages.camera.read import BoardFile
 from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 PICTURE_S = 30.0

@@ -50,6 +50,7 @@ from calib.stages.camera.model import (
     pack,
     scale_of,
 )
+from calib.stages.camera.options import BY_DEFAULT, Choices
 from calib.stages.camera.triage import Triage, triage, turned_views
 from calib.stages.camera.verdict import (
     judge,
@@ -434,26 +435,6 @@ _FAR_BETTER = 0.5
 
 
 @dataclass(frozen=True)
-class Choices:
-    """What a user decides.
-
-    Attributes
-    ----------
-    model : a key of `model.MODELS`, or "auto" for the choice by views held back.
-    skew : estimate the skew; None where views held back may choose it with the model.
-    loss : "none", "huber" or "cauchy".
-    board : one of `BOARDS`, or "auto" for the choice by views held back.
-    keep_all : use views and points that do not agree with the others as well; they are named all the same.
-    """
-
-    model: str = "auto"
-    skew: bool | None = None
-    loss: str = "none"
-    board: str = "rigid"
-    keep_all: bool = False
-
-
-@dataclass(frozen=True)
 class Intrinsics:
     """A camera, what it is worth, and how it was chosen.
 
@@ -563,7 +544,7 @@ def _worse(candidate: Candidate, other: Candidate) -> bool:
 def calibrate_camera(
     views: Sequence[View],
     image_size_px: tuple[int, int],
-    choices: Choices = Choices(),
+    choices: Choices = BY_DEFAULT,
     left_out: Sequence[LeftOut] = (),
 ) -> Intrinsics:
     """Calibrate a camera and judge the result.
@@ -614,7 +595,7 @@ def calibrate_camera(
         fit = sorted_out.everything
     if choices.loss != "none":
         fit = refitted(fit, loss=choices.loss)
-    board = choices.board
+    board: str = choices.board
     boards: tuple[Candidate, ...] = ()
     if board != "rigid":
         fit, board, boards = _with_board(fit, choices)

@@ -26,6 +26,7 @@ from calib.io.pictures import Picture, holds_pictures, list_pictures, read_pictu
 from calib.stages.camera.choice import most_informative
 from calib.stages.camera.corners import Detection, detect, find_size
 from calib.stages.camera.model import Board, LeftOut, View
+from calib.stages.camera.options import Told
 from calib.stages.camera.targets import (
     DICTIONARIES,
     Layout,
@@ -715,17 +716,6 @@ _OUTSIDE_PX = 1.0
 _LARGEST_M = 1e4
 _SMALLEST_M = 1e-6
 _NO_SQUARE = "the square's length is not given; intrinsics do not depend on it, lengths are in squares"
-
-
-@dataclass(frozen=True)
-class Told:
-    """What the command line says of the board and the pictures; None where it says nothing."""
-
-    corners: tuple[int, int] | None = None
-    square_m: float | None = None
-    image_size_px: tuple[int, int] | None = None
-    dictionary: str | None = None
-    topic: str | None = None
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
 from calib.core.options import NoOptions, option
 from calib.core.stage import Files, Stage
-from calib.core.units import parse_corners, parse_image_size, parse_region_px, parse_square_m
+from calib.core.units import parse_region_px
+from calib.stages.camera.options import IntrinsicsOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.words import Block
     from calib.stages.camera import lens, model, plane
-    from calib.stages.camera.intrinsics import Candidate, Choices, Intrinsics
+    from calib.stages.camera.intrinsics import Candidate, Intrinsics
     from calib.stages.camera.model import LeftOut
     from calib.stages.camera.read import ViewSet
     from calib.stages.camera.section import Camera, Lens, Plane
@@ -29,78 +30,27 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class IntrinsicsOptions:
-    """How a camera is calibrated."""
-
-    corners: tuple[int, int] | None = option(
-        None,
-        "Inner corners, columns x rows, as 7x5. [default: board.yaml, else found]",
-        metavar="CxR",
-        parse=parse_corners,
-    )
-    square_m: float | None = option(
-        None,
-        "Side of a square with its unit, as 20mm. [default: board.yaml]",
-        flag="square",
-        metavar="LENGTH",
-        parse=parse_square_m,
-    )
-    dictionary: str | None = option(
-        None,
-        "Markers of a ChArUco board, as 4X4_50. [default: board.yaml, else found]",
-        metavar="NAME",
-    )
-    topic: str | None = option(None, "Image topic of a bag. [default: the only one]", metavar="NAME")
-    image_size_px: tuple[int, int] | None = option(
-        None,
-        "Size of the pictures in px, for tables, as 640x480.",
-        flag="image-size",
-        metavar="WxH",
-        parse=parse_image_size,
-    )
-    model: Literal["auto", "pinhole", "radial2", "radial3", "fisheye4", "brown5", "rational8"] = option(
-        "auto", "Lens model; auto compares all on views held back."
-    )
-    skew: bool | None = option(
-        None, "Estimate the skew, or never. [default: with --model auto where the views show one]"
-    )
-    loss: Literal["none", "huber", "cauchy"] = option("none", "Robust loss of the residuals.")
-    board: Literal["rigid", "warp", "released", "auto"] = option(
-        "rigid", "The board: flat, bent by two parameters, with free corners, or compared."
-    )
-    keep_all: bool = option(
-        False, "Use pictures and points as well that do not agree with the others; by default they leave."
-    )
-
-
-@dataclass(frozen=True)
 class IntrinsicsInputs:
     """Views of a target, how to calibrate, and how long it took to find the views."""
 
     found: ViewSet
-    choices: Choices
+    options: IntrinsicsOptions
     detect_s: float
 
 
 def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
     import time
 
-    from calib.stages.camera.intrinsics import Choices
-    from calib.stages.camera.read import Told, read_views
+    from calib.stages.camera.read import read_views
 
     del rig
     began = time.perf_counter()
     with files.progress("finding boards") as progress:
-        views = read_views(
-            list(files.paths),
-            Told(options.corners, options.square_m, options.image_size_px, options.dictionary, options.topic),
-            progress,
-        )
+        views = read_views(list(files.paths), options, progress)
     for remark in views.remarks:
         files.narrate(remark)
     files.hashes.update(views.hashes)
-    choices = Choices(options.model, options.skew, options.loss, options.board, options.keep_all)
-    return IntrinsicsInputs(views, choices, time.perf_counter() - began)
+    return IntrinsicsInputs(views, options, time.perf_counter() - began)
 
 
 def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
@@ -114,7 +64,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
     from calib.stages.camera.section import Camera
 
     views = inputs.found
-    result = calibrate_camera(views.views, views.image_size_px, inputs.choices, views.left_out)
+    result = calibrate_camera(views.views, views.image_size_px, inputs.options, views.left_out)
     fit, known = result.calibration, result.covariance
     width, height = fit.camera.image_size_px
     grid = box_grid((0.0, 0.0, width - 1.0, height - 1.0), 17, 13).reshape(-1, 2)
