@@ -11,7 +11,6 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.stages.camera.bundle import (
     Calibration,
     Minimum,
-    held,
     homographies,
     joint_jacobian,
     linearise,
@@ -735,8 +734,7 @@ class Split:
 
 def widened(calibration: Calibration) -> Calibration:
     """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps."""
-    camera, fixed = calibration.camera, held(calibration)
-    if camera.model in ("brown5", "rational8", FISHEYE) or fixed not in ((), ("skew_px",)):
+    if calibration.camera.model in ("brown5", "rational8", FISHEYE):
         return calibration
     rich = refitted(calibration, model="brown5", max_iterations=_TWO_CAMERAS_MAX_ITERATIONS)
     # Coefficients that explain nothing only blur the difference of two cameras.

@@ -268,7 +268,6 @@ def candidates_by_model(
     image_size_px: tuple[int, int],
     *,
     skew: bool = False,
-    fixed: tuple[str, ...] = (),
     loss: str = "none",
 ) -> list[tuple[Candidate, Calibration]]:
     """Every lens model fitted to all views and judged on views held back, the simplest first.
@@ -278,14 +277,13 @@ def candidates_by_model(
     fits: list[Calibration] = []
 
     def fitted(model: str, start: Block | None) -> Calibration | None:
-        if 2 * observations.points < len(free_intrinsics(model, skew, fixed)) + 6 * observations.views + 1:
+        if 2 * observations.points < len(free_intrinsics(model, skew)) + 6 * observations.views + 1:
             return None
         fit = calibrate(
             observations,
             image_size_px,
             model,
             skew=skew,
-            fixed=fixed,
             loss=loss,
             start=start,
             max_iterations=_MAX_ITERATIONS,
@@ -295,7 +293,7 @@ def candidates_by_model(
 
     for model in MODELS:
         fit = None if model == FISHEYE else fitted(model, fits[-1].block if fits else None)
-        if fit is not None and model == "rational8" and not skew and not fixed:
+        if fit is not None and model == "rational8" and not skew:
             fit = _sturdier(fit, fits)
         fits += [] if fit is None else [fit]
     if any(map(_wide, fits)):
@@ -494,7 +492,6 @@ def _chosen_model(
     observations: Observations,
     image_size_px: tuple[int, int],
     choices: Choices,
-    fixed: tuple[str, ...],
     excluded: tuple[str, ...] = (),
 ) -> tuple[LensModel, Calibration | None, tuple[Candidate, ...]]:
     """The lens model, a fit of it to start from, and the comparison that chose it."""
@@ -505,7 +502,7 @@ def _chosen_model(
         return LensModel("radial2" if observations.views == 2 else "pinhole", asked), None, ()
 
     def compared(skew: bool) -> tuple[list[Candidate], list[Calibration], int]:
-        found = candidates_by_model(observations, image_size_px, skew=skew, fixed=fixed, loss=choices.loss)
+        found = candidates_by_model(observations, image_size_px, skew=skew, loss=choices.loss)
         candidates = [replace(one, soundness=0) if one.name in excluded else one for one, _ in found]
         return candidates, [fit for _, fit in found], chosen_lens(candidates, scale_of(image_size_px))
 
@@ -561,8 +558,7 @@ def calibrate_camera(
     everything, unusable = _usable(views, choices)
     everything, copies = without_copies(everything, image_size_px)
     unusable += copies
-    fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
-    sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
+    sorted_out, models = _sorted_out(everything, image_size_px, choices)
     of_all = sorted_out.everything
     turned = turned_views(of_all)
     if turned and _bent(of_all, turned):
@@ -570,7 +566,7 @@ def calibrate_camera(
     by_name = {one.name for one in turned}
     if turned and not choices.keep_all:
         everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
-        sorted_out, models = _sorted_out(everything, image_size_px, choices, fixed)
+        sorted_out, models = _sorted_out(everything, image_size_px, choices)
     odd = [*turned, *(one for one in sorted_out.left_out if one.name not in by_name)]
     leaving = [*left_out, *unusable, *odd]
     agree = sorted_out.calibration.observations.views
@@ -582,11 +578,10 @@ def calibrate_camera(
             findings += several
         elif any(one.severity == "inconsistent" for one in several):
             # Of two cameras that share the views neither is the odd one, and no view is to blame.
-            lens, start, models = _chosen_model(everything, image_size_px, choices, fixed)
+            lens, start, models = _chosen_model(everything, image_size_px, choices)
             first = None if start is None else start.block
-            sorted_out = Triage.of_all(
-                calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=first)
-            )
+            fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, start=first)
+            sorted_out = Triage.of_all(fit)
             leaving = [*left_out, *unusable, *turned]
             findings = list(of_leaving(leaving, everything.views, choices.keep_all))
     not_used = [*left_out, *unusable] if choices.keep_all else leaving
@@ -661,10 +656,10 @@ def _sorted_out(
     everything: Observations,
     image_size_px: tuple[int, int],
     choices: Choices,
-    fixed: tuple[str, ...],
     excluded: tuple[str, ...] = (),
 ) -> tuple[Triage, tuple[Candidate, ...]]:
     """The views that agree, by the model that views held back choose among them."""
+    fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
 
     def by(lens: LensModel, start: Block | None = None) -> Triage:
         fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=start)
@@ -672,7 +667,7 @@ def _sorted_out(
 
     observations, before = everything, None
     for _ in range(_TRIAGES):
-        lens, start, models = _chosen_model(observations, image_size_px, choices, fixed, excluded)
+        lens, start, models = _chosen_model(observations, image_size_px, choices, excluded)
         if lens == before:
             break
         # The start has the poses of the views that the model was chosen by, which may be fewer.
@@ -693,7 +688,7 @@ def _sorted_out(
     promised = next((one.soundness for one in models if one.name == str(lens)), 0)
     if promised == _SOUND > _soundness(found.calibration):
         # A few more steps, or other views, took the lens where it may not go.
-        return _sorted_out(everything, image_size_px, choices, fixed, (*excluded, str(lens)))
+        return _sorted_out(everything, image_size_px, choices, (*excluded, str(lens)))
     return found, models
 
 
