@@ -21,6 +21,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.constants import Constant, constants
+from calib.core.geometry import box_grid
 
 Sections = Mapping[str, Mapping[str, Any]]
 
@@ -205,6 +206,4 @@ def plane_change(
 
 def grid_m(workspace_m: Sequence[float]) -> FloatArray:
     """Places (rows, columns, 2) at which the plane is compared."""
-    x0, y0, x1, y1 = workspace_m
-    columns, rows = _GRID
-    return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
+    return box_grid(workspace_m, *_GRID)

@@ -10,6 +10,7 @@ out. H is scaled to a depth s of 1 at the points' centroid.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,12 @@ class Homography:
     covariance: FloatArray
     rms_px: float
     sigma_px: float
+
+
+def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> FloatArray:
+    """Places (rows, columns, 2) spread evenly over a box (x0, y0, x1, y1), its borders included."""
+    x0, y0, x1, y1 = box
+    return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
 
 
 def apply_homography(H: FloatArray, points: FloatArray) -> FloatArray:

@@ -11,14 +11,13 @@ from sets import Recipe, camera_of, take
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import apply_homography, fit_homography, map_jacobian
+from calib.core.geometry import apply_homography, box_grid, fit_homography, map_jacobian
 from calib.core.verdict import Verdict
 from calib.stages.camera.bundle import calibrate, covariance, rotation_exp
 from calib.stages.camera.model import (
     Board,
     Camera,
     View,
-    box_grid,
     camera_from_vector,
     pack,
     project,

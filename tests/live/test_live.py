@@ -30,6 +30,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from calib.cli.main import main
 from calib.core.errors import BadInputError
+from calib.core.geometry import box_grid
 from calib.io.logs import read_log
 from calib.io.serial import Frame, Inputs, Outputs
 from calib.live.album import Album
@@ -38,7 +39,7 @@ from calib.live.session import ENOUGH, Seen, Session, edge_blur_px
 from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
 from calib.stages.camera.intrinsics import calibrate_camera
-from calib.stages.camera.model import View, box_grid, pack
+from calib.stages.camera.model import View, pack
 from calib.stages.camera.options import Told
 from calib.stages.camera.read import BoardFile
 from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render

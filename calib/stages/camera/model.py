@@ -274,12 +274,6 @@ class Camera:
         )
 
 
-def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> FloatArray:
-    """Places (rows, columns, 2) spread evenly over a box (x0, y0, x1, y1), its borders included."""
-    x0, y0, x1, y1 = box
-    return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
-
-
 def scale_of(image_size_px: tuple[int, int]) -> float:
     """How many times larger than at up to 1000 pixels' width errors in pixels may be."""
     return max(1.0, max(image_size_px) / 1000)

@@ -10,10 +10,10 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import Homography, apply_homography, fit_homography, map_jacobian
+from calib.core.geometry import Homography, apply_homography, box_grid, fit_homography, map_jacobian
 from calib.core.verdict import Finding, Verdict
 from calib.solve.chance import tail_of_f
-from calib.stages.camera.model import Board, Camera, View, box_grid, project, undistort
+from calib.stages.camera.model import Board, Camera, View, project, undistort
 from calib.stages.camera.pose import Pose, fit_pose, plane_map, plane_pixels, pose_derivatives
 
 # ----------------------------------------------------------------------

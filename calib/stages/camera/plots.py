@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from calib.core.arrays import FloatArray, IntArray
+from calib.core.geometry import box_grid
 from calib.core.plot import (
     SIGMA,
     WIDTH_IN,
@@ -50,7 +51,7 @@ from calib.stages.camera.lens import (
     radial_sigma,
     shown_once,
 )
-from calib.stages.camera.model import Camera, box_grid, focal_px, fold_radius, vector_from_camera
+from calib.stages.camera.model import Camera, focal_px, fold_radius, vector_from_camera
 from calib.stages.camera.plane import Plane, moved_m
 from calib.stages.camera.pose import plane_pixels
 from calib.stages.camera.section import Lens

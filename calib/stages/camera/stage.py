@@ -57,10 +57,11 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
     """Calibrate, judge, and assemble the section."""
     import numpy as np
 
+    from calib.core.geometry import box_grid
     from calib.core.result import CovarianceTable, finite_or_none, judged
     from calib.stages.camera.bundle import projection_sigma_px
     from calib.stages.camera.intrinsics import calibrate_camera
-    from calib.stages.camera.model import ahead_radius, box_grid, distorted_normalised
+    from calib.stages.camera.model import ahead_radius, distorted_normalised
     from calib.stages.camera.section import Camera
 
     views = inputs.found

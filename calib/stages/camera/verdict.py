@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray
+from calib.core.geometry import box_grid
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.camera.bundle import (
     Calibration,
@@ -52,7 +53,7 @@ from calib.stages.camera.checks import (
     view_faults,
     widened,
 )
-from calib.stages.camera.model import LeftOut, Observations, box_grid, scale_of
+from calib.stages.camera.model import LeftOut, Observations, scale_of
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
