@@ -215,32 +215,20 @@ def _own_pose(camera: Camera, view: View) -> Pose | None:
 
 
 def _findings(
-    camera: Camera,
-    pose: Pose,
-    corners: tuple[FloatArray, FloatArray],
-    comparison: Comparison,
-    sigma: PositionSigma,
-    workspace_m: tuple[float, float, float, float],
-    camera_rms_px: float | None,
+    camera: Camera, plane: Plane, comparison: Comparison, camera_rms_px: float | None
 ) -> Iterator[Finding]:
-    """What speaks against a plane, and notes that do not.
-
-    Parameters
-    ----------
-    corners : (M, 2) of all pictures, on the plane and in the picture.
-    """
-    world_m, pixels = corners
+    """What speaks against a plane, and notes that do not."""
     if comparison.probability <= _MOVED_PROBABILITY and comparison.moved_px >= _MOVED_PX:
         text = (
             f"the pictures contradict each other: {comparison.moved_name} is {comparison.moved_px:.2f} px "
             "away from the common pose; the camera or the board moved in between"
         )
         yield Finding("inconsistent", text)
-    yield from _of_direction(pose, world_m, pixels)
-    yield from _of_residuals(camera, pose, world_m, pixels, camera_rms_px)
-    yield from _of_horizon(camera, pose)
-    yield from _of_precision(camera, pose, sigma, workspace_m)
-    unseen = float(np.mean(~np.isfinite(sigma.plane_mm[:, 0])))
+    yield from _of_direction(plane)
+    yield from _of_residuals(camera, plane, camera_rms_px)
+    yield from _of_horizon(camera, plane)
+    yield from _of_precision(camera, plane)
+    unseen = float(np.mean(~np.isfinite(plane.sigma.plane_mm[:, 0])))
     share = f"{100 * unseen:.0f} % of the workspace is outside the picture"
     if unseen == 1.0:
         yield Finding("poor", "no part of the workspace is in the picture")
@@ -249,18 +237,18 @@ def _findings(
         yield Finding("poor", f"{share}; {where}")
     elif unseen > 0.0:
         yield Finding("remark", f"{share}; sigma is given for the rest")
-    if sigma.intrinsics_mm is None:
+    if plane.sigma.intrinsics_mm is None:
         text = "the uncertainty of the intrinsics is not known and not part of the sigma"
         yield Finding("remark", text)
-    freedom = 2 * len(np.unique(np.round(world_m, 9), axis=0)) - 6
+    freedom = 2 * len(np.unique(np.round(plane.corners_m, 9), axis=0)) - 6
     if freedom < _FEW_FREEDOMS:
         yield Finding("remark", f"the sigma rests on {freedom} degrees of freedom only and is rough")
 
 
-def _of_direction(pose: Pose, world_m: FloatArray, pixels: FloatArray) -> Iterator[Finding]:
+def _of_direction(plane: Plane) -> Iterator[Finding]:
     """Whether the plane's direction can be known, and well."""
-    at = pose.R_CW[:, :2] @ world_m.mean(axis=0) + pose.t_CW_m
-    elevation = float(np.degrees(np.arcsin(min(1.0, pose.R_CW[:, 2] @ at / np.linalg.norm(at)))))
+    at, pixels = plane.R_CW[:, :2] @ plane.corners_m.mean(axis=0) + plane.t_CW_m, plane.corners_px
+    elevation = float(np.degrees(np.arcsin(min(1.0, plane.R_CW[:, 2] @ at / np.linalg.norm(at)))))
     width = float(np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(pixels)))
     if elevation < _ELEVATION_LOST_DEG or width < _SPREAD_LOST_PX:
         text = (
@@ -276,11 +264,9 @@ def _of_direction(pose: Pose, world_m: FloatArray, pixels: FloatArray) -> Iterat
         yield Finding("poor", text)
 
 
-def _of_residuals(
-    camera: Camera, pose: Pose, world_m: FloatArray, pixels: FloatArray, camera_rms_px: float | None
-) -> Iterator[Finding]:
-    rms = pose.rms_px
-    if pose.termination == "iterations":
+def _of_residuals(camera: Camera, plane: Plane, camera_rms_px: float | None) -> Iterator[Finding]:
+    world_m, pixels, rms = plane.corners_m, plane.corners_px, plane.rms_px
+    if plane.termination == "iterations":
         yield Finding("poor", "the fit of the pose did not converge")
     ideal = undistort(camera, pixels)
     usable = bool(np.isfinite(ideal).all())
@@ -320,7 +306,7 @@ def _of_residuals(
         yield Finding("poor", text)
 
 
-def _of_horizon(camera: Camera, pose: Pose) -> Iterator[Finding]:
+def _of_horizon(camera: Camera, plane: Plane) -> Iterator[Finding]:
     """The denominator of (2.12) must not cross zero within the picture.
 
     In that of a fisheye lens it does for any plane that is tilted; what is beyond has no place on the plane.
@@ -330,7 +316,7 @@ def _of_horizon(camera: Camera, pose: Pose) -> Iterator[Finding]:
     width, height = camera.image_size_px
     ideal = undistort(camera, box_grid((0.0, 0.0, width - 1.0, height - 1.0), 41, 31).reshape(-1, 2))
     ideal = ideal[np.isfinite(ideal).all(axis=1)]
-    last = np.linalg.inv(np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]))[2]
+    last = np.linalg.inv(np.column_stack([plane.R_CW[:, :2], plane.t_CW_m]))[2]
     beyond = float(np.mean(ideal @ last[:2] + last[2] <= 0.0)) if len(ideal) else 0.0
     if beyond > 0.0:
         text = (
@@ -340,18 +326,17 @@ def _of_horizon(camera: Camera, pose: Pose) -> Iterator[Finding]:
         yield Finding("poor", text)
 
 
-def _of_precision(
-    camera: Camera, pose: Pose, sigma: PositionSigma, workspace_m: tuple[float, float, float, float]
-) -> Iterator[Finding]:
+def _of_precision(camera: Camera, plane: Plane) -> Iterator[Finding]:
     """How well the pose is known over the workspace."""
-    seen = visible(camera, pose.R_CW, pose.t_CW_m, sigma.points_m)
+    sigma, (x0, y0, x1, y1) = plane.sigma, plane.workspace_m
+    seen = visible(camera, plane.R_CW, plane.t_CW_m, sigma.points_m)
     calibration_mm = sigma.calibration_mm[seen]
     if np.any(np.isinf(calibration_mm)):
         text = "the intrinsics themselves are not known: their covariance is infinite"
         yield Finding("poor", text)
     if not seen.any() or not np.all(np.isfinite(calibration_mm)):
         return
-    diagonal_mm = 1e3 * float(np.hypot(workspace_m[2] - workspace_m[0], workspace_m[3] - workspace_m[1]))
+    diagonal_mm = 1e3 * float(np.hypot(x1 - x0, y1 - y0))
     worst_mm = float(np.hypot(*sigma.plane_mm[seen].T).max())
     if worst_mm > _SIGMA_SHARE * diagonal_mm:
         text = (
@@ -359,12 +344,12 @@ def _of_precision(
             f"{diagonal_mm:.0f} mm"
         )
         yield Finding("poor", text)
-    if pose.other is not None:
-        cost, R, t = pose.other
+    if plane.other is not None:
+        cost, R, t = plane.other
         points = sigma.points_m[seen]
-        pixels = plane_pixels(camera, pose.R_CW, pose.t_CW_m, points)
+        pixels = plane_pixels(camera, plane.R_CW, plane.t_CW_m, points)
         apart = 1e3 * np.linalg.norm(plane_map(camera, R, t, pixels) - points, axis=1)
-        likely = cost - pose.cost_px2 < 9.0 * pose.sigma_px**2
+        likely = cost - plane.cost_px2 < 9.0 * plane.sigma_px**2
         if likely and np.nanmax(apart) > 3.0 * float(np.hypot(*calibration_mm.T).max()):
             text = (
                 "the plane tilted the other way fits as well and puts the marker up to "
@@ -461,12 +446,9 @@ def calibrate_plane(
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     sigma = position_sigma(camera, camera_covariance, pose, box_grid(box, 9, 9).reshape(-1, 2))
     direct = fit_homography(world_m, pixels, groups)
-    findings = _findings(camera, pose, (world_m, pixels), comparison, sigma, box, camera_rms_px)
-    verdict = Verdict.of(findings)
-
     read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)
     whole = replace(pose, covariance=_pose_covariance(pose, camera_covariance))
-    return Plane(
+    plane = Plane(
         **vars(whole),
         A=camera.K @ np.column_stack([pose.R_CW[:, :2], pose.t_CW_m]),
         rms_mm=1e3 * float(np.sqrt(np.nanmean(np.sum((read_m - world_m) ** 2, axis=1)))),
@@ -477,8 +459,9 @@ def calibrate_plane(
         sigma=sigma,
         direct=direct,
         direct_difference_mm=1e3 * np.linalg.norm(moved_m(camera, pose, direct, sigma.points_m), axis=1),
-        verdict=verdict,
+        verdict=Verdict(),
     )
+    return replace(plane, verdict=Verdict.of(_findings(camera, plane, comparison, camera_rms_px)))
 
 
 def _pose_covariance(pose: Pose, camera_covariance: FloatArray | None) -> FloatArray:
