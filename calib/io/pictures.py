@@ -103,7 +103,9 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _MAX_PIXELS = 178_000_000
 """Twice as many as Pillow warns of, which is where it refuses."""
 _JPEG = b"\xff\xd8"
-_JPEG_DAMAGE = ("premature end", "bad huffman", "bad arithmetic", "found marker", "inconsistent progression")
+_DAMAGE = re.compile(
+    "premature end|bad huffman|bad arithmetic|found marker|inconsistent progression", re.IGNORECASE
+)
 """Complaints of libjpeg after which parts of the picture are made up. Extraneous bytes are not among
 them: many cameras pad their pictures."""
 _STDERR = threading.Lock()
@@ -231,7 +233,7 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
         raise BadInputError(f"{where}: has more than {_MAX_PIXELS // 1_000_000} million pixels")
     if data.startswith(_JPEG):
         decoded, complaints = _decoded_with_complaints(data)
-        damage = next((line for line in complaints.splitlines() if _tells_of_damage(line)), None)
+        damage = next((line for line in complaints.splitlines() if _DAMAGE.search(line)), None)
         if decoded is None or damage is not None:
             why = "" if damage is None else f" ({damage.removeprefix('Corrupt JPEG data: ')[:80]})"
             raise BadInputError(f"{where}: is a truncated or damaged JPEG{why}")
@@ -283,10 +285,6 @@ def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
             os.close(before)
         heard.seek(0)
         return decoded, heard.read(10_000).decode("utf-8", "replace")
-
-
-def _tells_of_damage(complaint: str) -> bool:
-    return any(word in complaint.lower() for word in _JPEG_DAMAGE)
 
 
 def eight_bits(decoded: AnyArray) -> GrayImage:

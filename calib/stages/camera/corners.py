@@ -39,24 +39,14 @@ from calib.stages.camera.refine import (
 _TIE = 1e-9
 
 
-def turned_colours(colours: FloatArray, turns: int) -> FloatArray:
-    """Colours of a grid after quarter turns of its order.
-
-    Parameters
-    ----------
-    colours : (rows, columns), positive where the square between growing column and growing row of a
-        corner is bright. A quarter turn swaps the two squares that this can mean.
-    """
-    return np.asarray((-1.0) ** turns * np.rot90(colours, turns))
-
-
 def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: int) -> int | None:
     """Quarter turns (for `numpy.rot90`) that bring a grid into the order of the rule.
 
     Parameters
     ----------
     points : (r, c, 2) corners, not mirrored; r x c is rows x columns or columns x rows.
-    colours : (r, c) as in `turned_colours`.
+    colours : (r, c), positive where the square between growing column and growing row of a corner is
+        bright. A quarter turn swaps the two squares that this can mean.
 
     Returns
     -------
@@ -67,7 +57,7 @@ def canonical_turn(points: FloatArray, colours: FloatArray, columns: int, rows: 
         return None
     parity = checkered(rows, columns)
     # Outward of corner (0, 0) is the colour of the square across it, between growing column and row.
-    bright = {k: float(np.sum(np.sign(turned_colours(colours, k)) * parity)) > 0 for k in turns}
+    bright = {k: float(np.sum((-1.0) ** k * np.sign(np.rot90(colours, k)) * parity)) > 0 for k in turns}
     if len(set(bright.values())) == 2:
         turns = [k for k in turns if not bright[k]]
 

@@ -98,16 +98,6 @@ def _times_radial(radial: Sequence[float], x: AnyArray, y: AnyArray) -> tuple[An
     return x * P, y * P
 
 
-def exact_inverse(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Normalised undistorted coordinates (M, 2) by Newton's method, and which pixels have them (M,).
-
-    Of a fisheye lens those up to 75 degrees from the axis.
-    """
-    ideal = undistort(camera, pixels)
-    most = _STEEPEST if camera.fisheye else np.inf
-    return ideal, np.asarray(np.isfinite(ideal).all(axis=1) & (np.hypot(*ideal.T) < most))
-
-
 def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InverseLens:
     """The shortest inverse polynomial within `tolerance_px` of the exact inverse, else the best found.
 
@@ -118,7 +108,9 @@ def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InverseLens:
     """
     width, height = camera.image_size_px
     pixels = pixel_grid(camera.image_size_px, (-0.5, -0.5, width - 0.5, height - 0.5)).reshape(-1, 2)
-    ideal, seen = exact_inverse(camera, pixels)
+    ideal = undistort(camera, pixels)
+    steepest = _STEEPEST if camera.fisheye else np.inf
+    seen = np.isfinite(ideal).all(axis=1) & (np.hypot(*ideal.T) < steepest)
     covered, least = float(np.mean(seen)), np.inf
     best = InverseLens(radial=[], decentering_steps=0, max_error_px=None, covered=covered)
     if not seen.any():

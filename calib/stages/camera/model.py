@@ -220,10 +220,6 @@ FISHEYE = "fisheye4"
 """The model whose coefficients are those of a polynomial of the angle."""
 
 
-def _no_distortion() -> FloatArray:
-    return np.zeros(len(COEFFICIENTS))
-
-
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics of one camera.
@@ -243,7 +239,7 @@ class Camera:
     skew_px: float
     cx_px: float
     cy_px: float
-    distortion: FloatArray = field(default_factory=_no_distortion)
+    distortion: FloatArray = field(default_factory=lambda: np.zeros(len(COEFFICIENTS)))
 
     @property
     def fisheye(self) -> bool:

@@ -556,12 +556,6 @@ def _world_x_direction(pixels: FloatArray, board: Board, angle_rad: float) -> fl
     return float(np.arctan2(dv, du))
 
 
-def _local_square_px(pixels: FloatArray, board: Board) -> float:
-    """Mean length in pixels of the two sides that meet in the first corner."""
-    grid = pixels.reshape(board.rows, board.columns, 2)
-    return float(0.5 * (np.linalg.norm(grid[0, 1] - grid[0, 0]) + np.linalg.norm(grid[1, 0] - grid[0, 0])))
-
-
 def _wrapped_deg(angle_rad: float) -> float:
     return float(np.degrees((angle_rad + np.pi) % (2 * np.pi) - np.pi))
 
@@ -635,7 +629,8 @@ def _settle_by_pixel(
     distances = [float(np.linalg.norm(turned[0] - wanted)) for _, turned in candidates]
     best = int(np.argmin(distances))
     turn, chosen = candidates[best]
-    limit = 0.5 * _local_square_px(chosen, board)
+    # Half the mean of the two sides that meet there.
+    limit = 0.25 * float(np.linalg.norm(chosen[[1, board.columns]] - chosen[0], axis=1).sum())
     if distances[best] > limit:
         seen = ", ".join(f"({turned[0, 0]:.1f}, {turned[0, 1]:.1f})" for _, turned in candidates)
         raise BadInputError(

@@ -31,7 +31,6 @@ from calib.stages.camera.targets import (
     DICTIONARIES,
     Layout,
     detect_charuco,
-    dictionary_named,
     find_markers,
     in_place,
     name_of,
@@ -88,9 +87,12 @@ def read_board_file(folder: Path) -> BoardFile:
 
 
 def known_dictionary(text: str, where: str, error: type[CalibError] = BadInputError) -> str:
-    """The name of a dictionary of markers as OpenCV has it. Raises `error`, naming `where` it stands."""
-    name = dictionary_named(text)
-    if name is None:
+    """OpenCV's name of the dictionary that is meant, as 4x4_50 or DICT_4X4_50.
+
+    Raises `error`, naming `where` it stands.
+    """
+    name = text.strip().upper().removeprefix("DICT_")
+    if name not in DICTIONARIES:
         nearest = get_close_matches(text.upper(), DICTIONARIES, 1, 0.0)[0]
         raise error(
             f"{where}: {one_line(text)[:40]!r} is no dictionary of markers, expected one of OpenCV's, "

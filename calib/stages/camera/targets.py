@@ -105,12 +105,6 @@ class Layout:
         return np.stack([column, row], axis=1)
 
 
-def dictionary_named(text: str) -> str | None:
-    """The dictionary of `DICTIONARIES` that is meant, as 4x4_50 or DICT_4X4_50; None for none."""
-    name = text.strip().upper().removeprefix("DICT_")
-    return name if name in DICTIONARIES else None
-
-
 def dictionary_of(name: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of this name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
