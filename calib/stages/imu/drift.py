@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, NamedTuple
@@ -244,34 +244,20 @@ _SHORTEST_S = 2.0
 
 @dataclass(frozen=True)
 class LogDrift:
-    """One log.
+    """What is said of one log, and what that is drawn from.
 
     Attributes
     ----------
-    against : "truth", "rest" or "nothing".
-    judged_s : length of what slope, offset and Allan deviation rest on.
-    moving_s : length of what it moves.
-    upright : median share of gravity that is in the sensor's plane, squared; NaN without az. Where it is
-        small the plane is nearly level, and the angle hardly defined.
-    start_s : time of each part's first sample.
+    start_s : time of each part's first sample. period_s : from each to the next.
     truth_rad : the true angle in each part, NaN outside of its samples; None without.
-    truth_late_s : by which it was moved.
-    tracks : of each method. measures : what is said of it, by its name, in the same order.
-    skipped : sentences about methods that were left out.
+    tracks : of each method.
     """
 
-    source: str
-    sampling: Sampling
-    against: Literal["truth", "rest", "nothing"]
-    judged_s: float
-    moving_s: float
-    upright: float
+    section: DriftOfLog
     start_s: tuple[float, ...]
+    period_s: float
     truth_rad: tuple[FloatArray, ...] | None
-    truth_late_s: float
     tracks: tuple[Track, ...]
-    measures: dict[str, DriftMethod]
-    skipped: tuple[str, ...]
 
 
 def _settled(start: int, stop: int, period_s: float) -> slice:
@@ -286,6 +272,10 @@ def _no_turns(error: FloatArray) -> FloatArray:
 
 
 def _upright(log: Readings) -> float:
+    """Median share of gravity that is in the sensor's plane, squared; NaN without az.
+
+    Where it is small the plane is nearly level, and the angle hardly defined.
+    """
     if "az" not in log.axes:
         return math.nan
     ax, ay, az = (log.values[:, log.axes.index(axis)] for axis in ("ax", "ay", "az"))
@@ -411,27 +401,28 @@ def analyse_drift(
         ]
     phi_acc = by_name["accelerometer alone"]
     measures = {one.name: _measure(one, truth, phi_acc, stretches, moving, period_s) for one in tracks}
-    return LogDrift(
-        log.source,
-        sampling,
-        "truth" if truth is not None else "rest" if stretches else "nothing",
-        period_s * sum(where.stop - where.start for _, where in stretches),
-        period_s * sum(int(flags.sum()) for flags in moving),
-        _upright(log),
-        tuple(float(part.t_s[0]) for part in parts),
-        truth,
-        late_s,
-        tuple(tracks),
-        measures,
-        tuple(skipped),
+    against: Literal["truth", "rest", "nothing"] = "rest" if stretches else "nothing"
+    if truth is not None:
+        against = "truth"
+    section = DriftOfLog(
+        name=log.source,
+        **sampled(sampling),
+        against=against,
+        about=_ABOUT[against],
+        judged_s=period_s * sum(where.stop - where.start for _, where in stretches),
+        moving_s=period_s * sum(int(flags.sum()) for flags in moving),
+        methods=measures,
+        skipped=skipped,
+        remarks=[*_remarks(log, sampling, late_s)],
     )
+    return LogDrift(section, tuple(float(part.t_s[0]) for part in parts), period_s, truth, tuple(tracks))
 
 
-def spread_of(logs: Sequence[LogDrift]) -> dict[str, DriftSlopes]:
+def spread_of(logs: Sequence[DriftOfLog]) -> dict[str, DriftSlopes]:
     """Mean and spread of the slopes of each method over the logs that show one (Fig. 2.4)."""
     out = {}
-    for name in dict.fromkeys(name for log in logs for name in log.measures):
-        slopes = [log.measures[name].slope_degps for log in logs if name in log.measures]
+    for name in dict.fromkeys(name for log in logs for name in log.methods):
+        slopes = [log.methods[name].slope_degps for log in logs if name in log.methods]
         known = np.array([slope for slope in slopes if slope is not None])
         out[name] = DriftSlopes(
             mean_degps=float(known.mean()) if len(known) else None,
@@ -468,10 +459,11 @@ def solve_drift(inputs: DriftInputs) -> Drift:
     """Every way of getting the angle on every log, and how each drifts."""
     tuned = inputs.tuned
     logs = [analyse_drift(log, tuned, inputs.peers, inputs.narrate) for log in inputs.logs]
+    sections = [log.section for log in logs]
     return Drift(
         note=NOT_A_RANKING,
-        logs=[_drift_log(log) for log in logs],
-        methods=spread_of(logs),
+        logs=sections,
+        methods=spread_of(sections),
         provenance={"inputs": inputs.hashes},
         tuned=None
         if tuned is None
@@ -484,27 +476,19 @@ def solve_drift(inputs: DriftInputs) -> Drift:
     ).with_evidence(logs)
 
 
-def _drift_log(log: LogDrift) -> DriftOfLog:
-    remarks = [finding.text for finding in sampling_findings(log.sampling, source=log.source)]
-    if log.truth_late_s:
-        remarks.append(
-            f"{log.source}: true_phi_rad comes {1e3 * log.truth_late_s:.1f} ms later than the gyroscope "
+def _remarks(log: Readings, sampling: Sampling, truth_late_s: float) -> Iterator[str]:
+    """Sentences about a log, whose truth was moved by so much."""
+    for finding in sampling_findings(sampling, source=log.source):
+        yield finding.text
+    if truth_late_s:
+        yield (
+            f"{log.source}: true_phi_rad comes {1e3 * truth_late_s:.1f} ms later than the gyroscope "
             "turns; it is moved by that, and lags are against the gyroscope"
         )
-    if log.upright < _LEAST_UPRIGHT:
-        tilt = math.degrees(math.acos(math.sqrt(log.upright)))
-        remarks.append(
+    upright = _upright(log)
+    if upright < _LEAST_UPRIGHT:
+        tilt = math.degrees(math.acos(math.sqrt(upright)))
+        yield (
             f"{log.source}: gravity is {tilt:.0f} degrees out of the sensor's x-y plane, where the angle "
             "atan2(ay, ax) is hardly defined; noise and drift of all methods are large for that reason"
         )
-    return DriftOfLog(
-        name=log.source,
-        **sampled(log.sampling),
-        against=log.against,
-        about=_ABOUT[log.against],
-        judged_s=log.judged_s,
-        moving_s=log.moving_s,
-        methods=log.measures,
-        skipped=list(log.skipped),
-        remarks=remarks,
-    )

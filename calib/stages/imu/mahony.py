@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
+from calib.stages.imu.levelling import Levelling
 
 # ----------------------------------------------------------------------
 # The Mahony-Madgwick filter of the angle in the plane (2.1 - 2.3).
@@ -47,13 +47,8 @@ class Mahony:
         _run(t, phi_acc, w, self.Kp, self.Ki, phi, integral)
 
 
-class Filter(Protocol):
-    """What gives an angle: `Mahony` and `calib.stages.imu.levelling.Levelling`."""
-
-    def fill(
-        self, t: FloatArray, phi_acc: FloatArray, w: FloatArray, phi: FloatArray, integral: FloatArray
-    ) -> None:
-        """As `Mahony.fill`."""
+AngleFilter = Mahony | Levelling
+"""What can be asked for an angle."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,7 @@ def _run(
 
 
 def filter_log(
-    parameters: Filter,
+    parameters: AngleFilter,
     t_s: FloatArray,
     phi_acc_rad: FloatArray,
     rate_radps: FloatArray,

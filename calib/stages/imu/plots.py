@@ -284,9 +284,9 @@ def drift_plots(drift: Drift) -> dict[str, Figure]:
     """`drift_angles`, `drift_slopes` where there are any, and `drift_motion_1`, ... for logs that move."""
     logs: Sequence[LogDrift] = drift.evidence
     figures = {"drift_angles": _angles(logs)}
-    if any(m.slope_degps is not None for log in logs for m in log.measures.values()):
+    if any(m.slope_degps is not None for log in logs for m in log.section.methods.values()):
         figures["drift_slopes"] = _slopes(logs)
-    moving = {f"drift_motion_{i}": log for i, log in enumerate(logs, start=1) if log.moving_s > 0.0}
+    moving = {f"drift_motion_{i}": log for i, log in enumerate(logs, start=1) if log.section.moving_s > 0.0}
     return figures | {name: _in_motion(log) for name, log in moving.items()}
 
 
@@ -319,7 +319,7 @@ def _change(log: LogDrift, name: str, colour: Colour, logs: int) -> list[Curve]:
     """Change of the angle by one method in each part of a log."""
     curves: list[Curve] = []
     first = None
-    period = log.sampling.period_s
+    period = log.period_s
     for phi_rad in (track.phi_rad for track in log.tracks if track.name == name):
         for k, phi in enumerate(phi_rad):
             change = np.degrees(phi - log.truth_rad[k]) if log.truth_rad is not None else np.degrees(phi)
@@ -327,21 +327,21 @@ def _change(log: LogDrift, name: str, colour: Colour, logs: int) -> list[Curve]:
             if len(known):
                 first = float(np.mean(known[: max(round(1.0 / period), 1)])) if first is None else first
                 t = log.start_s[k] - log.start_s[0] + period * np.arange(len(change))
-                label = short(log.source, 24) if k == 0 and 1 < logs <= _MOST_IN_LEGEND else ""
+                label = short(log.section.name, 24) if k == 0 and 1 < logs <= _MOST_IN_LEGEND else ""
                 curves.append(Curve(*thinned(t, change - first), label, colour=colour, size=1.0))
     return curves
 
 
 def _slopes(logs: Sequence[LogDrift]) -> Figure:
     """Slope of each method in each log with its interval."""
-    names = list(dict.fromkeys(name for log in logs for name in log.measures))
+    names = list(dict.fromkeys(name for log in logs for name in log.section.methods))
     note = (
         "These are the slopes of the angle's error in each log, with 95 % intervals, from the first log at "
         f"the top to the last. The scale is linear within {_PM}0.01 degrees/s and logarithmic beyond."
     )
     marks: list[Mark] = [Rule("x", 0.0, "ink")]
     for j, (log, hue) in enumerate(zip(logs, _colours(logs), strict=True)):
-        have = {name: m for name, m in log.measures.items() if m.slope_degps is not None}
+        have = {name: m for name, m in log.section.methods.items() if m.slope_degps is not None}
         at = np.array([names.index(name) for name in have]) + 0.6 * ((j + 0.5) / len(logs) - 0.5)
         value = np.array([m.slope_degps for m in have.values()])
         ends = np.array([m.interval_degps for m in have.values()], dtype=np.float64)
@@ -354,7 +354,7 @@ def _slopes(logs: Sequence[LogDrift]) -> Figure:
 
 def _liveliest(log: LogDrift) -> tuple[int, slice]:
     """The part and the window in which it moves most, by the accelerometer-free angle."""
-    period = log.sampling.period_s
+    period = log.period_s
     tracks = {track.name: track for track in log.tracks}
     most, best = -1.0, (0, slice(0, 0))
     for k, phi in enumerate(tracks["MM 3/3"].phi_rad):
@@ -373,7 +373,7 @@ def _in_motion(log: LogDrift) -> Figure:
     if truth is None:
         note = "These twelve seconds move most. The log has no true angle: below is what differs from MM 3/3."
     k, where = _liveliest(log)
-    t = log.start_s[k] - log.start_s[0] + log.sampling.period_s * np.arange(where.start, where.stop)
+    t = log.start_s[k] - log.start_s[0] + log.period_s * np.arange(where.start, where.stop)
     tracks = {track.name: np.degrees(track.phi_rad[k][where]) for track in log.tracks}
     against = tracks["MM 3/3"] if truth is None else np.degrees(truth[k][where])
     above: list[Mark] = []
@@ -396,7 +396,7 @@ def _in_motion(log: LogDrift) -> Figure:
         Plot("", "angle (degrees)", above, x_limits=limits),
         Plot("time (s)", y, below, x_limits=limits),
     )
-    return Figure(f"In motion: {short(log.source, 78)}", note, panels, 4.9)
+    return Figure(f"In motion: {short(log.section.name, 78)}", note, panels, 4.9)
 
 
 # ----------------------------------------------------------------------

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from calib.io.logs import Log
     from calib.stages.imu.drift import DriftInputs
     from calib.stages.imu.intrinsics import IntrinsicsInputs
+    from calib.stages.imu.mahony import AngleFilter
     from calib.stages.imu.sampling import Readings
     from calib.stages.imu.section import Drift, Imu, OrientationFilter
-    from calib.stages.imu.tuning import AngleFilter, TuneInputs, TuneLog
+    from calib.stages.imu.tuning import TuneInputs, TuneLog
 
 
 def _readings(files: Files, options: LogOptions, read: Callable[[Log], Readings]) -> list[Readings]:

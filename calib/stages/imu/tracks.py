@@ -17,9 +17,15 @@ from calib.core.errors import pip_install
 from calib.core.units import GRAVITY_MPS2
 from calib.solve.clock import Part
 from calib.stages.imu.levelling import Levelling, level_three
-from calib.stages.imu.mahony import Mahony, MahonyState, accelerometer_angles, filter_log, mean_angle
+from calib.stages.imu.mahony import (
+    AngleFilter,
+    Mahony,
+    MahonyState,
+    accelerometer_angles,
+    filter_log,
+    mean_angle,
+)
 from calib.stages.imu.sampling import AXES, Readings
-from calib.stages.imu.tuning import AngleFilter
 
 # ----------------------------------------------------------------------
 # The rate of the angle in the plane of a sensor that is not exactly in plane.

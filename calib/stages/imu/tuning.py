@@ -20,12 +20,9 @@ from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.stages.imu.levelling import Levelling
 from calib.stages.imu.levelling import system as levelling_system
-from calib.stages.imu.mahony import Mahony, filter_log, mean_angle, wrapped
+from calib.stages.imu.mahony import AngleFilter, Mahony, filter_log, mean_angle, wrapped
 from calib.stages.imu.sampling import Sampling, sensor_findings
 from calib.stages.imu.section import FilterCandidate, FilterLog, OrientationFilter
-
-AngleFilter = Mahony | Levelling
-"""What can be asked for an angle."""
 
 F = TypeVar("F", Mahony, Levelling)
 
