@@ -114,16 +114,13 @@ class Runs:
     Attributes
     ----------
     follow : how far the pumps of the model can follow it, whatever the controller.
-    plant : name of the file of the plant, where it is not the model's.
     """
 
     model: Model
     reference: Reference
     follow: Following
     outcomes: Sequence[Outcome]
-    feedback: str
-    seed: int
-    plant: str | None = None
+    options: RunOptions
 
     @property
     def verdict(self) -> Verdict:
@@ -161,8 +158,7 @@ def _solve_run(inputs: RunInputs) -> Runs:
                 )
             )
     found = follow(model, wanted.path_m(model.plant.rest_length_m))
-    plant = None if options.plant is None else options.plant.name
-    return Runs(model, wanted, found, outcomes, options.feedback, options.seed, plant)
+    return Runs(model, wanted, found, outcomes, options)
 
 
 def _followed(reference: Reference, found: Following) -> dict[str, Any]:
@@ -185,11 +181,10 @@ def _run_document(runs: Runs) -> dict[str, Any]:
     for one in runs.outcomes:
         limited = {} if one.limited is None else {"limited": one.limited}
         rows.append({"controller": one.controller, **asdict(one.figures), **limited})
-    followed = _followed(runs.reference, runs.follow)
-    told = {"feedback": runs.feedback, "seed": runs.seed}
-    if runs.plant is not None:
-        told["plant"] = runs.plant
-    return {"control": {**told, **followed, "runs": rows}}
+    told: dict[str, Any] = {"feedback": runs.options.feedback, "seed": runs.options.seed}
+    if runs.options.plant is not None:
+        told["plant"] = runs.options.plant.name
+    return {"control": {**told, **_followed(runs.reference, runs.follow), "runs": rows}}
 
 
 def _run_words(runs: Runs) -> list[Block]:
@@ -213,8 +208,10 @@ def _run_words(runs: Runs) -> list[Block]:
         saturated = " ".join(f"{share:.0%}" for share in f.saturation)
         rows.append((one.controller, *row[: len(head)], saturated, f"{f.changes_pwm:.1f}"))
     rate_hz = 1.0 / runs.model.tick_s
-    first = f"{reference.name}: {reference.duration_s:g} s at {rate_hz:g} Hz, feedback from {runs.feedback}"
-    first += "" if runs.plant is None else f", on the plant of {one_line(runs.plant)}"
+    first = f"{reference.name}: {reference.duration_s:g} s at {rate_hz:g} Hz, feedback from "
+    first += runs.options.feedback
+    if runs.options.plant is not None:
+        first += f", on the plant of {one_line(runs.options.plant.name)}"
     table = Table(("", *head, "saturated", "PWM steps"), tuple(rows))
     return [Line(first), table, *(Line(text) for text in runs.verdict.remarks)]
 
@@ -296,7 +293,7 @@ def _read_check(files: Files, rig: Rig, options: CheckOptions) -> tuple[Model, R
 
 def _solve_check(inputs: tuple[Model, Reference]) -> Checked:
     from calib.stages.control.references import from_lengths
-    from calib.stages.control.tuning import brought_in, follow, slowed
+    from calib.stages.control.tuning import follow, slowed
 
     model, wanted = inputs
     path_m = wanted.path_m(model.plant.rest_length_m)
@@ -304,11 +301,11 @@ def _solve_check(inputs: tuple[Model, Reference]) -> Checked:
     if found.possible:
         return Checked(model, wanted, found)
     try:
-        q_m, _ = slowed(model, path_m)
+        q_m, moved_m = slowed(model, path_m)
         slower = from_lengths(model, f"{wanted.name}, slowed", q_m)
     except BadInputError as error:
         return Checked(model, wanted, found, never=str(error))
-    return Checked(model, wanted, found, slower, brought_in(model, path_m)[1])
+    return Checked(model, wanted, found, slower, moved_m)
 
 
 def _check_document(checked: Checked) -> dict[str, Any]:

@@ -474,8 +474,8 @@ def _least_times(model: Model, points: FloatArray) -> FloatArray:
     return np.asarray(np.max(np.maximum(up, down), axis=1))
 
 
-def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, Following]:
-    """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and the proof.
+def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+    """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and how far it moved.
 
     Jumps become the fastest way along the straight line between their ends. Lengths that lie outside of the
     reachable set by less than `CLOSE_M`, as those of a recorded run with its noise, are brought in first.
@@ -483,7 +483,7 @@ def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, Following]:
     would take longer than two hours.
     """
     h = model.tick_s
-    q, _ = brought_in(model, q_m)
+    q, moved = brought_in(model, q_m)
     points, times = _path(q, h)
     outside = np.flatnonzero(~reachable(model, points))
     if len(outside):
@@ -502,9 +502,8 @@ def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, Following]:
         ticks = h * np.arange(max(count, 3))
         slow = np.stack([np.interp(ticks, t, points[:, i]) for i in range(2)], axis=1)
         slow = _rounded(slow, h, 1.0 + attempt * 0.5)
-        proof = follow(model, slow)
-        if proof.possible:
-            return slow, proof
+        if follow(model, slow).possible:
+            return slow, moved
     raise BadInputError("reference: no speed was found at which the pumps follow it")
 
 
