@@ -1,4 +1,4 @@
-"""Names for the array types that signatures use."""
+"""Names for the array types that signatures use, and two ways to cut an array."""
 
 from __future__ import annotations
 
@@ -13,3 +13,14 @@ ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 GrayImage: TypeAlias = npt.NDArray[np.uint8]
 AnyArray: TypeAlias = npt.NDArray[Any]
+
+
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """First and behind the last of each run of set flags."""
+    edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def blocks(values: FloatArray, size: int) -> FloatArray:
+    """Values (n, ...) in whole blocks (n // size, size, ...); what is left at the end is left out."""
+    return values[: len(values) // size * size].reshape(-1, size, *values.shape[1:])

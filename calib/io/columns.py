@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import FloatArray, IntArray, blocks
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.options import LogOptions
@@ -593,13 +593,11 @@ def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
 
 def calm_windows(values: FloatArray) -> FloatArray:
     """The calmest tenth (w, size, axes) of windows of some 50 readings (n, axes), at least one."""
-    size = min(_CALM_WINDOW, len(values))
-    count = len(values) // size
-    windows = values[: count * size].reshape(count, size, -1)
+    windows = blocks(values, min(_CALM_WINDOW, len(values)))
     # Relative to each axis's own middle, so that units play no part.
     loud = windows.std(axis=1)
     loud = (loud / np.maximum(np.median(loud, axis=0), 1e-12)).max(axis=1)
-    return windows[np.argsort(loud, kind="stable")[: max(math.ceil(_CALM * count), 1)]]
+    return windows[np.argsort(loud, kind="stable")[: max(math.ceil(_CALM * len(windows)), 1)]]
 
 
 def _with_accel(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
@@ -683,10 +681,7 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
     angle = np.concatenate([[0.0], np.cumsum(-z[1:] * np.diff(t_s))])
     period = max(float(np.median(np.diff(t_s))), 1e-6)
     size = min(max(round(1.0 / period), 4), len(phi))
-    count = len(phi) // size
-    by_force, by_gyro = (
-        float(np.median(x[: count * size].reshape(count, size).std(axis=1))) for x in (phi, angle)
-    )
+    by_force, by_gyro = (float(np.median(blocks(x, size).std(axis=1))) for x in (phi, angle))
     unit = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
     flat = rates.ndim == 1 or force.shape[1] == 2 or float(np.median(np.abs(unit[:, 2]))) < 0.35
     size = min(max(round((_BLOCK_S if flat else _BLOCK_3D_S) / period), 2), len(phi))

@@ -28,7 +28,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, is_bag, shown
 from calib.core.options import NOTHING_STATED, LogOptions
@@ -658,8 +658,7 @@ def _lasting(same: BoolArray, t_s: FloatArray) -> list[tuple[int, int]]:
     if not 0.0 < share < 1.0:
         return []
     least = max(math.log(_HELD_CHANCE) / math.log(share), _FEWEST)
-    edges = np.flatnonzero(np.diff(same.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    return [(a, b) for a, b in edges.tolist() if b - a >= least and t_s[b] - t_s[a] >= _HELD_S]
+    return [(a, b) for a, b in runs(same) if b - a >= least and t_s[b] - t_s[a] >= _HELD_S]
 
 
 def _frozen(log: Log, names: Sequence[str]) -> Finding | None:

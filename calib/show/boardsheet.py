@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
+from calib.core.arrays import runs
 from calib.core.errors import BadInputError
 from calib.core.writing import Kind, holds
 from calib.stages.camera.model import Board
@@ -123,8 +123,7 @@ def _markers(columns: int, rows: int, layout: _Layout, dictionary: str) -> list[
         left = layout.left + i * layout.square + margin
         top = layout.bottom + (rows + 1 - j) * layout.square - margin
         for row, line in enumerate(black):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], line, [0]]).astype(int)))
-            for first, end in edges.reshape(-1, 2):
+            for first, end in runs(line):
                 box = (left + first * cell, top - (row + 1) * cell, (end - first) * cell, cell)
                 commands.append(" ".join(_number(value) for value in box) + " re")
     return [*commands, "f"]

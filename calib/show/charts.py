@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import AnyArray, FloatArray
+from calib.core.arrays import AnyArray, FloatArray, runs
 from calib.core.errors import DISTRIBUTION, BadInputError
 from calib.core.plot import (
     STEEP,
@@ -303,8 +303,7 @@ class _Panel:
             low, high = np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
         known = np.isfinite(low) & np.isfinite(high)
         label = _words(ribbon.label)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
-        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        for begin, end in runs(known):
             part = slice(begin, end)
             trace = {
                 "type": "scatter",

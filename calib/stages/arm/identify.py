@@ -24,7 +24,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import FloatArray, IntArray, blocks
 from calib.stages.arm.model import (
     DAILY,
     DRIVES,
@@ -254,8 +254,7 @@ _Error = Callable[[Sequence[_Pair], _Pair], float]
 
 
 def _thinned(values: FloatArray, step_s: float) -> FloatArray:
-    size = round(step_s / STEP_S)
-    return np.asarray(values[: len(values) // size * size].reshape(-1, size).mean(axis=1))
+    return np.asarray(blocks(values, round(step_s / STEP_S)).mean(axis=1))
 
 
 def _arx_rows(u: FloatArray, y: FloatArray, order: int) -> FloatArray:

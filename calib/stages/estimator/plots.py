@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, runs
 from calib.core.plot import (
     SIGMA,
     Band,
@@ -86,8 +86,7 @@ def _states(result: Replayed) -> Figure:
     gated = _named(trace, "gated_camera") == 1.0
     # NaN where there is no driven model.
     kinematic = _named(trace, "driven_weight") < 0.5
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], kinematic, [False]]).astype(np.int8)))
-    stretches = [Band("x", t[i], t[j - 1], colour="ochre") for i, j in edges.reshape(-1, 2)]
+    stretches = [Band("x", t[i], t[j - 1], colour="ochre") for i, j in runs(kinematic)]
     if stretches:
         note += " Where it is shaded the kinematic model speaks."
     panels = []

@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Verdict
@@ -22,10 +22,8 @@ from calib.stages.imu.mahony import Mahony, mean_angle, wrapped
 from calib.stages.imu.sampling import (
     Readings,
     Sampling,
-    blocks,
     regular_parts,
     rest_parts,
-    runs,
     sampled,
     sampling_findings,
     sensor_findings,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, blocks
 from calib.core.plot import (
     SIGMA,
     Band,
@@ -34,7 +34,6 @@ from calib.stages.imu.allan import model_variance
 from calib.stages.imu.drift import LogDrift
 from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
 from calib.stages.imu.mahony import Mahony, filter_log, wrapped
-from calib.stages.imu.sampling import blocks
 from calib.stages.imu.section import Drift, Imu, ImuIntrinsics, OrientationFilter
 from calib.stages.imu.static import AxisNoise, Static, StaticLog
 from calib.stages.imu.tuning import Piece, Tuning

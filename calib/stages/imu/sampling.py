@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding
@@ -158,12 +158,6 @@ def sampling_findings(
         )
 
 
-def runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """First and behind the last of each run of set flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int64), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _step(values: FloatArray) -> float:
     """Quantisation step: the least distance of readings, where all are whole multiples of it apart."""
     levels = np.unique(values)
@@ -266,11 +260,6 @@ class Motion:
 
 def _window(period_s: float) -> int:
     return max(_FEWEST, round(_WINDOW_S / period_s))
-
-
-def blocks(values: FloatArray, size: int) -> FloatArray:
-    """Values (n, ...) in whole blocks (n // size, size, ...); what is left at the end is left out."""
-    return values[: len(values) // size * size].reshape(-1, size, *values.shape[1:])
 
 
 def quiet_spread(parts: tuple[Part, ...], period_s: float) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, blocks
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Severity, Verdict
@@ -19,7 +19,6 @@ from calib.stages.imu.sampling import (
     Motion,
     Readings,
     Sampling,
-    blocks,
     check_rate,
     regular_parts,
     rest_parts,
