@@ -21,18 +21,8 @@ from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.camera.model import project
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
-from calib.stages.estimator.constant_gain import (
-    ALONE,
-    BOOST,
-    BOOST_TICKS,
-    MOST_DELAY_TICKS,
-    MOVING_TICKS,
-    PATIENCE,
-    SHAKING_RADPS2,
-    Gains,
-    TickNoise,
-    design,
-)
+from calib.stages.estimator import constant_gain
+from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, SHAKING_RADPS2, Gains, TickNoise
 from calib.stages.estimator.section import EstimatorGain
 from calib.stages.estimator.sensors import GRAVITY_MPS2
 from calib.stages.firmware.section import Envelope
@@ -422,7 +412,7 @@ def _designed(lookup: Lookup, rate_hz: float, delay: float, plane: PlaneConstant
     shaken = math.hypot(lookup.number("align.accel_noise_mps2.0", 0.0), SHAKING_RADPS2 * reach)
     gyro = lookup.number("align.gyro_noise_radps", 0.0)
     noise = TickNoise(float(across) / lever, float(along), gyro, shaken / GRAVITY_MPS2)
-    return design(noise, rate_hz, delay / rate_hz, lever)
+    return constant_gain.design(noise, rate_hz, delay / rate_hz, lever)
 
 
 def _fused(
@@ -459,11 +449,7 @@ def _fused(
         "accel": np.column_stack([rows, rows @ imu["bias"]]),
         "gain": gain,
         "weak": k * _WEAK_MPS2,
-        "alone": ALONE,
-        "boost": BOOST,
-        "boost_ticks": BOOST_TICKS,
-        "moving_ticks": MOVING_TICKS,
-        "patience": PATIENCE,
+        "estimator": constant_gain,
     }
 
 
