@@ -336,6 +336,10 @@ class Evidence:
     measured: IntArray
     sigma_px: float
 
+    def cost_at(self, d: FloatArray) -> FloatArray:
+        """c_i(d), (N,)."""
+        return np.asarray(self.cost + 2 * self.b @ d + np.einsum("g,ngh,h->n", d, self.S, d))
+
 
 def eliminated(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """S (N, G, G) and b (N, G) of views, their poses eliminated, from `bundle.Linearised`."""

@@ -226,7 +226,7 @@ def _by_evidence(fit: Calibration, folds: Sequence[IntArray]) -> FloatArray:
     for fold in folds:
         kept = np.setdiff1d(np.arange(len(squared)), fold)
         d = -scaled_inverse(found.S[kept].sum(axis=0)) @ found.b[kept].sum(axis=0)
-        squared[fold] = found.cost[fold] + (2 * found.b[fold] + found.S[fold] @ d) @ d
+        squared[fold] = found.cost_at(d)[fold]
     return squared / np.maximum(found.measured / 2, 1)
 
 

@@ -131,10 +131,15 @@ class _Disagreement:
         return np.where(self.freedom > 0, found, 1.0)
 
 
-def _disagreement(
-    S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray, core: BoolArray
-) -> _Disagreement:
-    """T_i of every view against the core without it; S scaled to order one."""
+def _scaled(found: Evidence, whole: FloatArray) -> tuple[Evidence, FloatArray]:
+    """The evidence in units in which the diagonal of `whole` (G, G) is one, and these units (G,)."""
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    return replace(found, S=found.S * unit[:, None] * unit, b=found.b * unit), unit
+
+
+def _disagreement(found: Evidence, core: BoolArray) -> _Disagreement:
+    """T_i of every view against the core without it, from `_scaled` evidence."""
+    S, b = found.S, found.b
     G = b.shape[1]
     inside = core[:, None].astype(np.float64)
     S_core, b_core = S[core].sum(axis=0), b[core].sum(axis=0)
@@ -149,9 +154,9 @@ def _disagreement(
     counts = told > _TOLD
     told = np.where(counts, told, 1.0)
     freedom = counts.sum(axis=1)
-    there = cost + 2 * (b * d).sum(axis=1) + np.einsum("ng,ngh,nh->n", d, S, d)
+    there = found.cost + 2 * (b * d).sum(axis=1) + np.einsum("ng,ngh,nh->n", d, S, d)
     own = there - np.where(counts, y2 / told, 0.0).sum(axis=1)
-    variance = np.maximum(own, 0.0) / np.maximum(measured - 6 - freedom, 1)
+    variance = np.maximum(own, 0.0) / np.maximum(found.measured - 6 - freedom, 1)
     typical = max(float(np.median(variance[core])), 1e-12)
     white = np.where(counts, y2 / (told * (1 + told)), 0.0).sum(axis=1) / np.maximum(freedom, 1) / typical
     phi2 = max(float(np.median(white[core])) / _MEDIAN_CHI2, 1.0)
@@ -160,13 +165,13 @@ def _disagreement(
     return _Disagreement(S_core, d, score, freedom, T / np.maximum(freedom, 1), variance, typical, phi2)
 
 
-def _first_core(S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray) -> BoolArray:
+def _first_core(found: Evidence) -> BoolArray:
     """The six tenths of the views that fit one camera best, (N,).
 
     Concentration starts from all views and from those without one or two that would gain most by a camera of
     their own: a single view that tells much draws the fit so far that the others look odd.
     """
-    N = len(b)
+    S, b, N = found.S, found.b, len(found.b)
     size = min(max(int(np.ceil(_CORE_SHARE * N)), 4), N)
     every = np.ones(N, dtype=np.bool_)
     whole = S.sum(axis=0)
@@ -178,15 +183,15 @@ def _first_core(S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArr
     best, least = every, np.inf
     for core in starts:
         for _ in range(_CONCENTRATION_STEPS):
-            order = np.argsort(_disagreement(S, b, cost, measured, core).ratio, kind="stable")
+            order = np.argsort(_disagreement(found, core).ratio, kind="stable")
             new = np.isin(np.arange(N), order[:size])
             if np.array_equal(new, core):
                 break
             core = new
         d = -scaled_inverse(S[core].sum(axis=0)) @ b[core].sum(axis=0)
-        there = (cost + 2 * b @ d + np.einsum("g,ngh,h->n", d, S, d))[core].sum()
-        if there / measured[core].sum() < least:
-            best, least = core, there / measured[core].sum()
+        there = found.cost_at(d)[core].sum() / found.measured[core].sum()
+        if there < least:
+            best, least = core, there
     return best
 
 
@@ -198,16 +203,15 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
     calibration : camera of the core, with the poses of all views; the target rigid, without robust loss.
     """
     found = evidence(calibration)
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(found.S.sum(axis=0)), 1e-300))
-    S, b = found.S * unit[:, None] * unit, found.b * unit
+    found, unit = _scaled(found, found.S.sum(axis=0))
     if core is None:
-        core = _first_core(S, b, found.cost, found.measured)
-    one = _disagreement(S, b, found.cost, found.measured, core)
+        core = _first_core(found)
+    one = _disagreement(found, core)
     cov = scaled_inverse(one.S_core) * one.typical * one.phi2
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # Leaving the core moves the camera from the core's solution to d; joining it, by one step to the view.
-    centre = -scaled_inverse(one.S_core) @ b[core].sum(axis=0)
-    joined = np.linalg.solve(one.S_core + S + 1e-12 * np.eye(len(sigma)), one.score[..., None])[..., 0]
+    centre = -scaled_inverse(one.S_core) @ found.b[core].sum(axis=0)
+    joined = np.linalg.solve(one.S_core + found.S + 1e-12 * np.eye(len(sigma)), one.score[..., None])[..., 0]
     shift = np.where(core[:, None], one.d - centre, joined)
     rms = np.sqrt(found.cost / np.maximum(found.measured / 2, 1))
     noise = np.sqrt(one.variance)
@@ -282,16 +286,14 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
     most = _TURN_WORSE * _without_one(found) * float(found.measured.sum())
     for how, names in _TURNS.items():
         flip, offset = _reflection(calibration, names)
-        S = np.stack([found.S, flip[:, None] * found.S * flip])
-        b = np.stack([found.b, flip * (found.b + found.S @ offset)])
-        cost = found.cost + 2 * found.b @ offset + np.einsum("g,ngh,h->n", offset, found.S, offset)
-        turned, d, total = _parted(S, b, np.stack([found.cost, cost]))
+        b = flip * (found.b + found.S @ offset)
+        other = replace(found, S=flip[:, None] * found.S * flip, b=b, cost=found.cost_at(offset))
+        turned, d, total = _parted(found, other)
         if not turned.any() or total > most:
             continue
-        there = np.stack([found.cost, cost]) + 2 * b @ d + np.einsum("g,sngh,h->sn", d, S, d)
-        of = turned.astype(np.int64), np.arange(N)
+        there, read = (found.cost_at(d), other.cost_at(d)), _read(found, other, turned)
         sigma_px = np.sqrt(max(total, 0.0) / max(calibration.degrees_of_freedom, 1))
-        at_d = replace(found, S=S[of], b=b[of] + S[of] @ d, sigma_px=float(sigma_px))
+        at_d = replace(read, b=read.b + read.S @ d, sigma_px=float(sigma_px))
         least = found.cost - gain(found.S, found.b)
         least_gain = (_TURN_SIGMAS * overdispersion(at_d) * sigma_px) ** 2
         # Where they explain it alike a picture was turned: that happens more often.
@@ -301,7 +303,7 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
         clear = turned & (by > least_gain)
         clear &= there[1] - least < _TURN_EXCESS * (there[0] - least)
         if clear.any():
-            agree, odd = _agree_turned(S, b, np.stack([found.cost, cost]), found.measured, turned)
+            agree, odd = _agree_turned(found, other, turned)
             clear &= agree & odd
             # Where one was turned others may have been that say less.
             if clear.any():
@@ -327,24 +329,31 @@ def _without_one(found: Evidence) -> float:
     return float((cost / (found.measured.sum() - found.measured)).min())
 
 
-def _agree_turned(
-    S: FloatArray, b: FloatArray, cost: FloatArray, measured: IntArray, turned: BoolArray
-) -> tuple[BoolArray, BoolArray]:
+def _read(found: Evidence, other: Evidence, turned: BoolArray) -> Evidence:
+    """The views as they are, and those that are turned as they are then."""
+    of = turned[:, None]
+    return replace(
+        found,
+        S=np.where(of[..., None], other.S, found.S),
+        b=np.where(of, other.b, found.b),
+        cost=np.where(turned, other.cost, found.cost),
+    )
+
+
+def _agree_turned(found: Evidence, other: Evidence, turned: BoolArray) -> tuple[BoolArray, BoolArray]:
     """Which views (N,) agree with those that agree best when these are turned, and which are odd as they are.
 
     Another view that is odd may make some look turned.
     """
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(S[0].sum(axis=0)), 1e-300))
-    S, b = S * unit[:, None] * unit, b * unit
-    of = turned.astype(np.int64), np.arange(len(turned))
-    core = _first_core(S[of], b[of], cost[of], measured)
-    agree = _disagreement(S[of], b[of], cost[of], measured, core).chance(core) > _CHANCE
+    whole, every = found.S.sum(axis=0), np.arange(len(turned))
+    read = _scaled(_read(found, other, turned), whole)[0]
+    core = _first_core(read)
+    agree = _disagreement(read, core).chance(core) > _CHANCE
     odd = np.zeros(len(turned), dtype=np.bool_)
     for i in np.flatnonzero(agree & turned):
-        as_is = turned & (of[1] != i)
-        others = core & (of[1] != i)
-        now = as_is.astype(np.int64), of[1]
-        odd[i] = _disagreement(S[now], b[now], cost[now], measured, others).chance(others)[i] < _CHANCE
+        others = core & (every != i)
+        now = _scaled(_read(found, other, turned & (every != i)), whole)[0]
+        odd[i] = _disagreement(now, others).chance(others)[i] < _CHANCE
     return agree, odd
 
 
@@ -357,31 +366,29 @@ def _reflection(calibration: Calibration, names: tuple[str, ...]) -> tuple[Float
     return np.where(changes, -1.0, 1.0), np.where(changes, full - 2.0 * now, 0.0)
 
 
-def _parted(S: FloatArray, b: FloatArray, cost: FloatArray) -> tuple[BoolArray, FloatArray, float]:
+def _parted(found: Evidence, other: Evidence) -> tuple[BoolArray, FloatArray, float]:
     """Which views (N,) are turned, the step d (G,) to the camera that all then share, and their cost.
 
     Parameters
     ----------
-    S, b, cost : (2, N, ...) of the views as they are and turned.
+    found, other : of the views as they are, and turned.
     """
-    N, G = b.shape[1:]
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(S[0].sum(axis=0)), 1e-300))
-    S, b = S * unit[:, None] * unit, b * unit
-    every = np.arange(N)
-    weak = 1e-3 * S[0].sum(axis=0) / N + 1e-9 * np.eye(G)
+    whole = found.S.sum(axis=0)
+    (found, unit), (other, _) = _scaled(found, whole), _scaled(other, whole)
+    N, G = found.b.shape
+    weak = 1e-3 * found.S.sum(axis=0) / N + 1e-9 * np.eye(G)
     seeds = np.unique(np.linspace(0, N - 1, _TURN_STARTS).astype(np.int64))
     best, least = (np.zeros(N, dtype=np.bool_), np.zeros(G)), np.inf
     for start in (None, *seeds):
-        d = np.zeros(G) if start is None else -np.linalg.solve(S[0, start] + weak, b[0, start])
+        d = np.zeros(G) if start is None else -np.linalg.solve(found.S[start] + weak, found.b[start])
         turned = np.zeros(N, dtype=np.bool_)
         for step in range(_TURN_STEPS):
-            there = cost + 2 * b @ d + np.einsum("g,sngh,h->sn", d, S, d)
-            before, turned = turned, there[1] < there[0]
+            before, turned = turned, other.cost_at(d) < found.cost_at(d)
             if step and np.array_equal(turned, before):
                 break
-            of = turned.astype(np.int64), every
-            d = -scaled_inverse(S[of].sum(axis=0)) @ b[of].sum(axis=0)
-        total = float(cost[of].sum() + b[of].sum(axis=0) @ d)
+            read = _read(found, other, turned)
+            d = -scaled_inverse(read.S.sum(axis=0)) @ read.b.sum(axis=0)
+        total = float(read.cost.sum() + read.b.sum(axis=0) @ d)
         if 2 * turned.sum() <= N and total < least:
             best, least = (turned, d), total
     return best[0], best[1] * unit, least
