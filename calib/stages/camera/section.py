@@ -78,21 +78,12 @@ class Camera(Result):
         """The camera as the equations take it."""
         import numpy as np
 
-        from calib.stages.camera.model import COEFFICIENTS
-        from calib.stages.camera.model import Camera as Optics
+        from calib.stages.camera.model import COEFFICIENTS, INTRINSICS, camera_from_vector
 
         width, height = self.image_size_px
-        coefficients = np.array([getattr(self.distortion, name) for name in COEFFICIENTS])
-        return Optics(
-            self.model,
-            (width, height),
-            self.fx_px,
-            self.fy_px,
-            self.skew_px,
-            self.cx_px,
-            self.cy_px,
-            coefficients,
-        )
+        five = [getattr(self, name) for name in INTRINSICS[:5]]
+        coefficients = [getattr(self.distortion, name) for name in COEFFICIENTS]
+        return camera_from_vector(self.model, (width, height), np.array(five + coefficients))
 
     @property
     def intrinsic_covariance(self) -> FloatArray | None:

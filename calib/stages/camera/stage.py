@@ -101,7 +101,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
 
 def _optics(camera: model.Camera) -> dict[str, Any]:
     """The keys of the section that say what the camera is."""
-    from calib.stages.camera.model import COEFFICIENTS, MODELS
+    from calib.stages.camera.model import COEFFICIENTS, INTRINSICS, MODELS
     from calib.stages.camera.section import Distortion
 
     named = dict(zip(COEFFICIENTS, camera.distortion.tolist(), strict=True))
@@ -110,11 +110,7 @@ def _optics(camera: model.Camera) -> dict[str, Any]:
     return {
         "model": camera.model,
         "image_size_px": list(camera.image_size_px),
-        "fx_px": camera.fx_px,
-        "fy_px": camera.fy_px,
-        "skew_px": camera.skew_px,
-        "cx_px": camera.cx_px,
-        "cy_px": camera.cy_px,
+        **{name: getattr(camera, name) for name in INTRINSICS[:5]},
         "distortion": Distortion(**kept),
     }
 
