@@ -183,25 +183,22 @@ def compare_pictures(
 ) -> tuple[tuple[PictureFit, ...], Comparison]:
     """Fit every picture by itself and test whether the camera stood still."""
     fits: list[PictureFit] = []
-    joint = separate = 0.0
-    tested = freedom = at = 0
-    for view in views:
-        M = len(view.pixels)
-        residuals = pose.residuals_px[at : at + M]
-        at += M
-        moved = np.nan
+    tested: list[tuple[float, float, int]] = []
+    ends = np.cumsum([len(view.pixels) for view in views])[:-1]
+    for view, residuals in zip(views, np.split(pose.residuals_px, ends), strict=True):
+        moved, squared = np.nan, np.sum(residuals**2, axis=1)
         own = _own_pose(camera, view) if len(views) > 1 else None
         if own is not None:
-            joint += float(np.sum(residuals**2))
-            separate += own.cost_px2
-            tested, freedom = tested + 1, freedom + 2 * M - 6
+            tested.append((float(squared.sum()), own.cost_px2, 2 * len(squared) - 6))
             moved = float(np.sqrt(np.mean(np.sum((own.residuals_px - residuals) ** 2, axis=1))))
-        fits.append(PictureFit(view.name, M, float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))), moved))
-    if tested < 2:
+        fits.append(PictureFit(view.name, len(squared), float(np.sqrt(np.mean(squared))), moved))
+    if len(tested) < 2:
         return tuple(fits), Comparison(1.0, 0.0, "", 1.0)
-    between = max(joint - separate, 0.0) / (6 * (tested - 1))
+    joint, separate, freedom = np.sum(tested, axis=0).tolist()
+    between_freedom = 6 * (len(tested) - 1)
+    between = max(joint - separate, 0.0) / between_freedom
     ratio = between / max(separate / freedom, 1e-24)
-    probability = float(tail_of_f(6 * (tested - 1), freedom, ratio))
+    probability = float(tail_of_f(between_freedom, freedom, ratio))
     worst = max((fit for fit in fits if np.isfinite(fit.moved_px)), key=lambda fit: fit.moved_px)
     inflation = ratio if probability < _SCATTER_PROBABILITY else 1.0
     return tuple(fits), Comparison(probability, worst.moved_px, worst.name, max(inflation, 1.0))

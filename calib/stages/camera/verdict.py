@@ -274,12 +274,11 @@ def _of_richer(fit: Calibration, wide: Calibration) -> Iterator[Finding]:
 
 def _of_projection(fit: Calibration, known: Covariance, inflation: float) -> Iterator[Finding]:
     """Standard deviation of projection, inflated, where points were seen."""
-    sigma_px = np.inf
     outline = hull(fit.observations.pixels[fit.observations.present])
     grid = box_grid([*outline.min(axis=0), *outline.max(axis=0)], 14, 12).reshape(-1, 2)
     spread = inflation * projection_sigma_px(fit, known, grid[inside_hull(grid, outline)])
-    if np.any(bounded := ~np.isnan(spread)):
-        sigma_px = float(np.median(spread[bounded]))
+    bounded = spread[~np.isnan(spread)]
+    sigma_px = float(np.median(bounded)) if len(bounded) else np.inf
     limit = Limits.projection_share * max(fit.camera.image_size_px)
     if sigma_px > limit:
         text = (
