@@ -284,7 +284,6 @@ BAD: dict[str, tuple[Maker, tuple[str, ...]]] = {
     ),
     "u and v swapped": (_changed(lambda i, p, _: p[:, ::-1].copy()), (_CONTRADICTS, "poor", _NO)),
     "outliers": (_changed(_outliers), (_CONTRADICTS, "poor")),
-    "image size too small": (_resized((320, 240)), (_CONTRADICTS,)),
     "image size too large": (_resized((1280, 960)), ("poor",)),
 }
 """Sets that must not be blessed: how to make them, and the verdicts that are right."""

@@ -463,27 +463,18 @@ def _radius_share(calibration: Calibration) -> float:
 
 
 def _of_frame(calibration: Calibration) -> Iterator[Finding]:
-    """Points listed mirrored, the picture's size, and the principal point in it."""
-    camera, observations = calibration.camera, calibration.observations
+    """Points listed mirrored, and the principal point in the picture."""
+    camera = calibration.camera
     mirrored = calibration.block.R_CT[:, 2, 2] < 0.0
     if mirrored.any() and not mirrored.all():
         fewer = mirrored if mirrored.mean() <= 0.5 else ~mirrored
-        names = [observations.names[i] for i in np.flatnonzero(fewer)]
+        names = [calibration.observations.names[i] for i in np.flatnonzero(fewer)]
         text = (
             f"{listed(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to "
             "the other views: the points are listed in another order."
         )
         yield Finding("inconsistent", text, "Give the points of all views in the same order.")
     width, height = camera.image_size_px
-    pixels = observations.pixels[observations.present]
-    outside = float(((pixels < -1.0) | (pixels > [width, height])).any(axis=1).mean())
-    if outside > 0.0:
-        text = (
-            f"{100 * outside:.1f} % of the points lie outside of the picture of {width}x{height} "
-            "pixels: its size is wrong, or u and v are swapped."
-        )
-        advice = "Check the image size and the order of u and v."
-        yield Finding("inconsistent" if outside > 0.01 else "poor", text, advice)
     off = max(
         abs(camera.cx_px - 0.5 * (width - 1)) / width,
         abs(camera.cy_px - 0.5 * (height - 1)) / height,
@@ -510,8 +501,7 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
         return listed([f"{names[i]} ({rms[i]:.2f} px)" for i in which], 4)
 
     if bad.any():
-        worse = [i for i in np.argsort(-rms).tolist() if bad[i]]
-        good = float(np.median(rms[~bad])) if not bad.all() else typical
+        worse, good = [i for i in np.argsort(-rms).tolist() if bad[i]], float(np.median(rms[~bad]))
         text = (
             f"{with_rms(worse)} {'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is "
             f"{good:.2f} px: misplaced corners, another board, or motion during the exposure."
@@ -565,7 +555,7 @@ def quiet_rms(rms: FloatArray) -> float:
 
 def _of_points(distance: FloatArray, fine: BoolArray, names: tuple[str, ...]) -> Iterator[Finding]:
     """Points (N, M) of good views whose residuals are far above those of their view, and of all."""
-    bad = far_points(distance, fine, float(np.median(distance[fine])) if fine.any() else 0.0)
+    bad = far_points(distance, fine, float(np.median(distance[fine])))
     count = int(bad.sum())
     if count:
         share = count / int(fine.sum())
