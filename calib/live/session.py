@@ -10,7 +10,7 @@ next pose.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from calib.stages.camera.checks import (
     image_outline,
     tilted,
 )
-from calib.stages.camera.corners import Detection, detect, find_size, resized
+from calib.stages.camera.corners import Detection, detect, find_size, reduced, resized
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lattice import find_lattices, find_saddles
 from calib.stages.camera.model import Board, Camera, View, pack, project
@@ -485,11 +485,8 @@ def edge_blur_px(gray: GrayImage, grid: FloatArray) -> float:
 
 def _size_of(gray: GrayImage) -> tuple[int, int] | None:
     """Inner corners of a board of unknown size, looked for only where there is some lattice."""
-    n = 1
-    while gray.size / n**2 > 120_000:
-        n += 1
-    some: Sequence[Any] = find_lattices(find_saddles(resized(gray, 1.0 / n).image), least=9)
-    return find_size(gray) if len(some) else None
+    some = find_lattices(find_saddles(reduced(gray, 120_000).image), least=9)
+    return find_size(gray) if some else None
 
 
 def _other_size(size_px: tuple[int, int], expected_px: tuple[int, int]) -> str:

@@ -358,8 +358,9 @@ def complete(lattice: Lattice) -> FloatArray | None:
     return np.where(seen[..., None], lattice.points, prediction.points)
 
 
-def _for_opencv(gray: GrayImage) -> Level:
-    return resized(gray, 1.0 / max(1, math.ceil(math.sqrt(gray.size / _OPENCV_PIXELS))))
+def reduced(gray: GrayImage, pixels: int) -> Level:
+    """A copy of no more than so many pixels, or the picture."""
+    return resized(gray, 1.0 / max(1, math.ceil(math.sqrt(gray.size / pixels))))
 
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -389,7 +390,7 @@ def _candidates(gray: GrayImage, columns: int, rows: int, quick: bool) -> Iterat
         yield grids
     if quick or not fragments or min(gray.shape) < _MIN_SIDE_PX:
         return
-    level = _for_opencv(gray)
+    level = reduced(gray, _OPENCV_PIXELS)
     for finder in _FINDERS:
         try:
             found, corners = finder(level.image, (columns, rows))
@@ -463,7 +464,7 @@ def find_size(gray: GrayImage) -> tuple[int, int] | None:
 
 
 def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
-    level = _for_opencv(gray)
+    level = reduced(gray, _OPENCV_PIXELS)
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     try:
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(level.image, (3, 3), flags)

@@ -216,13 +216,10 @@ def displacement_field(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 def central_region(image_size_px: tuple[int, int]) -> Region:
     """The source document's region of interest, the central 160x120 of 316x208 pixels, to scale."""
-    box = []
-    for size, part in zip(image_size_px, (160 / 316, 120 / 208), strict=True):
-        count = max(1, round(size * part))
-        first = (size - count) // 2
-        box.append((float(first), float(first + count - 1)))
-    (u0, u1), (v0, v1) = box
-    return u0, v0, u1, v1
+    size = np.array(image_size_px)
+    count = np.maximum(1.0, np.round(size * (160 / 316, 120 / 208)))
+    u0, v0 = ((size - count) // 2).tolist()
+    return u0, v0, u0 + float(count[0]) - 1.0, v0 + float(count[1]) - 1.0
 
 
 def distortion_kind(camera: Camera) -> str:
