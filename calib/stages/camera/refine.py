@@ -912,12 +912,13 @@ def _closer_looked(part: Part, fit: LocalFit, grid: FloatArray) -> LocalFit:
 
 @dataclass(frozen=True)
 class _Check:
-    """What the other corners say of each of N fits.
+    """What the other corners say of each of N fits: a prediction, and what follows from it.
 
     Its place, the distance to it, the distance that is doubtful and the distance that is out of the
     question; `grid` (rows, columns, 2) holds the good fits and the places of the others.
     """
 
+    prediction: Prediction
     placed: FloatArray
     away: FloatArray
     bound: FloatArray
@@ -925,7 +926,7 @@ class _Check:
     grid: FloatArray
 
 
-def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Prediction] | None:
+def _checked(part: Part, fit: LocalFit, good: BoolArray) -> _Check | None:
     prediction = predict(fit.points.reshape(*part.shape, 2), good.reshape(part.shape), part.lens)
     if prediction is None:
         return None
@@ -935,30 +936,28 @@ def _checked(part: Part, fit: LocalFit, good: BoolArray) -> tuple[_Check, Predic
     away = np.linalg.norm(fit.points - placed, axis=1)
     far = _FAR * square
     bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), far)
-    return _Check(placed, away, bound, far, grid), prediction
+    return _Check(prediction, placed, away, bound, far, grid)
 
 
 def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction] | None:
     """Fit again, from where the others place them, the corners that failed or disagree with the others."""
     good = _trusted(part, fit)
     for window in _RESCUE_WINDOWS:
-        checked = _checked(part, fit, good)
-        if checked is None:
+        check = _checked(part, fit, good)
+        if check is None:
             return None
-        check, prediction = checked
         doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
         if len(doubtful) == 0:
-            return fit, good, prediction
+            return fit, good, check.prediction
         again = fit_corners(part, check.placed[doubtful], frames_of(check.grid).take(doubtful), window=window)
         trial = _merged(fit, again, doubtful)
         near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
         fit = _merged(fit, again, doubtful, use)
         good[doubtful[use]] = True
-    checked = _checked(part, fit, good)
-    if checked is None:
+    check = _checked(part, fit, good)
+    if check is None:
         return None
-    check = checked[0]
     # A clean fit may contradict the others: neither board nor lens need be smooth. A disturbed one may not.
     clean = fit.residual < _DISTURBED * np.median(fit.residual) + 0.02
     beside = extrapolated(fit.points.reshape(*part.shape, 2))[1:-1, 1:-1].reshape(-1, 2)
@@ -994,9 +993,9 @@ def _spread(count: int) -> IntArray:
     return np.linspace(0, count - 1, min(_FEW_CORNERS, count)).astype(np.int64)
 
 
-def _first_fit(part: Part, some: IntArray) -> LocalFit:
-    frames = frames_of(part.points).take(some)
-    return fit_corners(part, part.points.reshape(-1, 2)[some], frames, _FIRST_ITERATIONS, _FIRST_REACH_PX)
+def _first_fit(part: Part, some: IntArray, warm: LocalFit | None = None) -> LocalFit:
+    points, frames = part.points.reshape(-1, 2)[some], frames_of(part.points).take(some)
+    return fit_corners(part, points, frames, _FIRST_ITERATIONS, _FIRST_REACH_PX, warm=warm)
 
 
 def _blocks(width_px: float) -> float:
@@ -1012,21 +1011,13 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
     """The same with the halo that fits best, where the corners are not those of a picture as taken."""
     if float(np.median(misshape(first, part.noise))) < _HALO_MISSHAPE:
         return part, first
-    every = part.points.reshape(-1, 2)
-    frames = frames_of(part.points)
+    count = len(first.points)
 
     def with_halo(halo_px: float, chosen: IntArray) -> tuple[Part, LocalFit]:
         other = replace(part, halo_px=halo_px)
-        return other, fit_corners(
-            other,
-            every[chosen],
-            frames.take(chosen),
-            _FIRST_ITERATIONS,
-            _FIRST_REACH_PX,
-            warm=first.take(chosen),
-        )
+        return other, _first_fit(other, chosen, first.take(chosen))
 
-    some = _spread(len(every))
+    some = _spread(count)
     plain = float(np.median(misshape(first.take(some), part.noise)))
     left: dict[float, float] = {}
     for halo_px in _HALOS_PX:
@@ -1034,7 +1025,7 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
         if min(left.values()) > _HALO_SIGN * plain:
             return part, first
     best = min(sorted(left), key=lambda halo_px: left[halo_px])
-    return with_halo(best, np.arange(len(every))) if left[best] < _HALO_GAIN * plain else (part, first)
+    return with_halo(best, np.arange(count)) if left[best] < _HALO_GAIN * plain else (part, first)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
@@ -1069,10 +1060,8 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
             part, moved.reshape(-1, 2)[unsteady], frames_of(moved).take(unsteady), warm=fit.take(unsteady)
         )
         fit = again if len(unsteady) == len(fit.points) else _merged(fit, again, unsteady)
-        before, moved = (
-            moved,
-            np.where(_sound(part, fit)[:, None], fit.points, moved.reshape(-1, 2)).reshape(start.shape),
-        )
+        before = moved
+        moved = np.where(_sound(part, fit)[:, None], fit.points, before.reshape(-1, 2)).reshape(start.shape)
         steady = np.max(np.abs(moved - before), axis=2).ravel() < _STEADY_PX
         unsteady = np.flatnonzero(~(steady & fit.converged))
         if len(unsteady) == 0:
