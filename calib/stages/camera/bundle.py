@@ -374,12 +374,8 @@ def initial_guess(observations: Observations, image_size_px: tuple[int, int], sk
     attempts = (["skew"] if skew and observations.views >= 3 else []) + (
         ["no skew"] if observations.views >= 2 else []
     )
-    K = None
-    for unknowns in [*attempts, "centre"]:
-        K = closed_form_intrinsics(H, image_size_px, unknowns)
-        if K is not None and _plausible(K, longest, centre):
-            break
-        K = None
+    found = (closed_form_intrinsics(H, image_size_px, unknowns) for unknowns in [*attempts, "centre"])
+    K = next((one for one in found if one is not None and _plausible(one, longest, centre)), None)
     if K is None:
         focal = longest * np.geomspace(0.3, 10.0, 60)
         candidates = [np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1.0]]) for f in focal]
@@ -509,12 +505,12 @@ class Calibration:
 
 
 def starting_block(
-    observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray | None = None
+    observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray
 ) -> Block:
     """Zhang's closed form as a start, with k1 and k2 by linear least squares where they are free."""
     start = initial_guess(observations, image_size_px, skew)
     lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
-    if free is None or not np.isin(lens, free).all():
+    if not np.isin(lens, free).all():
         return start
     at = linearise(start, observations, lens, None)
     if at is None:
@@ -567,7 +563,7 @@ def _fisheye_start(observations: Observations, image_size_px: tuple[int, int], f
     starts = [start for start in starts if start.posed.all()]
     tried = [minimise(start, observations, free, max_iterations=_TRIED_ITERATIONS) for start in starts]
     if not any(np.isfinite(one.cost) for one in tried):
-        return replace(starting_block(observations, image_size_px, skew=False), fisheye=True)
+        return replace(initial_guess(observations, image_size_px, skew=False), fisheye=True)
     return min(tried, key=lambda one: one.cost).block
 
 

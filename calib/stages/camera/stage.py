@@ -267,17 +267,15 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
     world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
     views, orientation = [], []
     for view in search.views:
-        if search.layout is not None:
-            view = replace(view, target_m=world_m)
-            views.append(View(view.name, *view.counted()))
-            orientation.append(f"{view.name}: The board's markers say which corner is (0, 0).")
-            continue
-        placed = settle_orientation(
-            view.pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
-        )
-        kept = slice(None) if view.measured is None else placed.reordered(view.measured, search.board)
-        views.append(View(view.name, world_m[kept], placed.pixels[kept]))
-        orientation.append(f"{view.name}: {placed.how}")
+        pixels, kept, how = view.pixels, view.measured, "The board's markers say which corner is (0, 0)."
+        assert kept is not None
+        if search.layout is None:
+            placed = settle_orientation(
+                pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
+            )
+            pixels, kept, how = placed.pixels, placed.reordered(kept, search.board), placed.how
+        views.append(View(view.name, world_m[kept], pixels[kept]))
+        orientation.append(f"{view.name}: {how}")
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
     return PlaneInputs(
         rig.camera, views, rig.workspace_m, tuple(orientation), search.left_out, stated.simulated
