@@ -125,9 +125,7 @@ def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
     from calib.core.rig import Rig
     from calib.stages.camera.formats import to_kalibr, to_opencv, to_ros
 
-    section = Rig.load(rig, missing_ok=True).camera
-    if section is None:
-        raise BadInputError(f"{shown(rig)}: has no camera yet; run calib intrinsics first")
+    section = Rig.load(rig, missing_ok=True).needed("camera", rig)
     camera = section.optics
     text = {
         "ros": lambda: to_ros(camera, name),
@@ -143,9 +141,7 @@ def _imu_text(rig: Path, topic: str | None) -> tuple[str, str]:
 
     if topic is not None and not re.fullmatch(r"[A-Za-z~/][\w~/]*", topic, re.ASCII):
         raise UsageError(f"--name: {one_line(topic)[:60]!r} is no topic, expected for instance /imu0")
-    section = Rig.load(rig, missing_ok=True).imu
-    if section is None:
-        raise BadInputError(f"{shown(rig)}: has no imu yet; run calib imu static first")
+    section = Rig.load(rig, missing_ok=True).needed("imu", rig)
     return to_kalibr(section, topic or "/imu0"), section.verdict.word
 
 

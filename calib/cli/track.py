@@ -181,13 +181,9 @@ class _DiscOnPlane:
         from calib.core.rig import Rig
 
         known = Rig.load(path, missing_ok=True)
-        camera, plane = known.camera, known.current_plane(path)
-        if camera is None or plane is None:
-            missing = "camera" if camera is None else "plane"
-            verb = "intrinsics" if camera is None else "extrinsics"
-            raise BadInputError(
-                f"{shown(path)}: has no {missing} yet, which --diameter needs; run calib {verb} first"
-            )
+        camera, _ = (known.needed(name, path, ", which --diameter needs") for name in ("camera", "plane"))
+        plane = known.current_plane(path)
+        assert plane is not None
         return _DiscOnPlane(diameter_m, camera, plane)
 
     def refuse_frame(self, frame: AnyArray, source: str) -> None:

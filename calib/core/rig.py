@@ -357,6 +357,13 @@ class Rig:
         values = self.standing
         return machine_from(*({k: v for k, (v, _) in values[name].items()} for name in ("actuator", "pump")))
 
+    def needed(self, name: str, source: Path | str, why: str = "") -> Any:
+        """A section. Raises `BadInputError`, which says the verb that makes it, where there is none."""
+        section = getattr(self, name)
+        if section is None:
+            raise BadInputError(f"{shown(source)}: has no {name} yet{why}; run calib {_FIRST[name]} first")
+        return section
+
     def current_plane(self, source: Path | str) -> Plane | None:
         """The plane; `BadInputError` where it was calibrated with another camera than the rig's."""
         if self.plane is None or self.camera is None:
@@ -398,6 +405,11 @@ class Rig:
 
 
 _MOST_OFF_PX = 0.01
+_FIRST = {
+    "camera": "intrinsics", "plane": "extrinsics", "imu": "imu static", "align": "align",
+    "arm": "identify arm",
+}  # fmt: skip
+"""Verb that makes a section which another needs."""
 _AGAIN = {
     "plane": "extrinsics", "lens": "distortion", "lowpass": "lowpass", "orientation_filter": "imu tune",
     "align": "align", "actuator": "identify", "pump": "identify", "controller": "control tune",

@@ -199,10 +199,7 @@ class Stage:
         from pydantic import ValidationError
 
         for name in self.needs:
-            if getattr(rig, name) is None:
-                raise BadInputError(
-                    f"{shown(files.rig_path)}: has no {name} yet; run calib {_VERBS[name]} first"
-                )
+            rig.needed(name, files.rig_path)
         inputs = self.read(files, rig, options)
         for sentence in files.remarks:
             files.narrate(sentence)
@@ -271,7 +268,3 @@ def finite(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     return [finite(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-_VERBS = {"camera": "intrinsics", "plane": "extrinsics", "align": "align", "imu": "imu static"}
-"""Verb that makes a section."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from calib.core.errors import BadInputError, UsageError
+from calib.core.errors import UsageError
 from calib.core.files import shown
 from calib.core.options import PoseOptions, option
 from calib.core.stage import Files, Stage, later
@@ -467,13 +467,12 @@ def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validate
 
     logs = _with_states(files, options)
     if all(is_arm_log(columns_of(path, options) or ()) for path in files.paths):
-        if rig.arm is None:
-            raise BadInputError(f"{shown(files.rig_path)}: has no arm yet; run calib identify arm first")
+        arm = rig.needed("arm", files.rig_path)
         # An arm's trials are read by its own stage.
         from calib.stages.arm.stage import Options, held_trials
 
         arm_options = Options(columns=options.columns, load=options.load, day=options.day)
-        return ValidateInputs((), held_trials(files, rig.arm, arm_options), rig)
+        return ValidateInputs((), held_trials(files, arm, arm_options), rig)
     tracks = [begun_track(files, path, rig, options, states) for path, states in logs]
     if IMPROVED not in models_of(rig):
         files.remarks.append(
