@@ -522,7 +522,7 @@ def test_two_cameras_are_separated(shuffled: bool) -> None:
     assert split.ratio > 2
     assert (split.second == truth).mean() >= 17 / 18
     assert split.difference["fx_px"] == pytest.approx(0.03 * camera.fx_px, abs=4 * split.sigma["fx_px"])
-    assert split.split_rms_px < split.rms_px
+    assert split.split_rms_px < wide.rms_px
     assert split.in_order == (not shuffled)
     if not shuffled:
         np.testing.assert_array_equal(split.second, truth)

@@ -720,16 +720,12 @@ class Covariance:
     ----------
     names : the estimated intrinsics, in order.
     intrinsics : (P, P); infinite where the data leave a direction free.
-    deformation : (K,) standard deviations of the target's deformation, metres.
-    poses : (N, 6, 6) rotation vector (rad, left of R_CT) and translation (m) of each view.
     joint : (P + 6, P + 6) of the intrinsics and the common motion g (rad, m).
     distance_m : median distance of the targets' centres, where projection uncertainty is quoted.
     """
 
     names: tuple[str, ...]
     intrinsics: FloatArray
-    deformation: FloatArray
-    poses: FloatArray
     joint: FloatArray
     distance_m: float
 
@@ -742,7 +738,7 @@ class Covariance:
 
 
 def covariance(calibration: Calibration, variance_px2: float | None = None) -> Covariance:
-    """Covariance of everything that was estimated.
+    """Covariance of the intrinsics and the common motion, everything else that was estimated following.
 
     Parameters
     ----------
@@ -753,7 +749,6 @@ def covariance(calibration: Calibration, variance_px2: float | None = None) -> C
     P = len(calibration.free)
     G = P + len(calibration.block.deformation)
     V, W, U = H[:, G:, G:], H[:, :G, G:], H[:, :G, :G].sum(axis=0)
-    views = len(H)
     t = calibration.block.t_CT_m
     distance = float(np.median(np.linalg.norm(t, axis=1)))
     try:
@@ -768,13 +763,10 @@ def covariance(calibration: Calibration, variance_px2: float | None = None) -> C
         return Covariance(
             calibration.free_names,
             np.diag(np.full(P, np.inf)),
-            np.full(G - P, np.inf),
-            np.full((views, 6, 6), np.inf),
             np.diag(np.full(P + 6, np.inf)),
             distance,
         )
-    poses = V_inverse + E @ S_inverse @ E.transpose(0, 2, 1)
-    motion = np.zeros((views, 6, 6))
+    motion = np.zeros((len(H), 6, 6))
     motion[:, :3, :3] = motion[:, 3:, 3:] = np.eye(3)
     motion[:, 3:, :3] = -cross_matrices(t)
     weighted = motion.transpose(0, 2, 1) @ V
@@ -788,14 +780,7 @@ def covariance(calibration: Calibration, variance_px2: float | None = None) -> C
     joint[P:, :P] = (of_shared @ S_inverse)[:, :P]
     joint[:P, P:] = joint[P:, :P].T
     joint[P:, P:] = of_shared @ S_inverse @ of_shared.T + own
-    return Covariance(
-        calibration.free_names,
-        variance * S_inverse[:P, :P],
-        np.sqrt(variance * np.diag(S_inverse)[P:]),
-        variance * poses,
-        variance * joint,
-        distance,
-    )
+    return Covariance(calibration.free_names, variance * S_inverse[:P, :P], variance * joint, distance)
 
 
 def joint_jacobian(calibration: Calibration, points_C: FloatArray) -> FloatArray:

@@ -707,9 +707,9 @@ class Split:
     Attributes
     ----------
     second : (N,) True for the views of the smaller or later group.
-    statistic : T2, see the module.
-    chance : what T2 reaches with one camera: mean and 3.5 standard deviations of replicates.
-    rms_px, split_rms_px : before and after.
+    ratio : T2, see above, over what it reaches with one camera, by mean and 3.5 standard deviations of
+        replicates.
+    split_rms_px : RMS after it.
     apart_px : root mean square distance, over the directions that were seen, of where the two cameras show
         them, one turned to meet the other.
     difference : intrinsics of the second group less those of the first, by name.
@@ -717,18 +717,11 @@ class Split:
     """
 
     second: BoolArray
-    statistic: float
-    chance: float
-    rms_px: float
+    ratio: float
     split_rms_px: float
     apart_px: float
     difference: dict[str, float]
     sigma: dict[str, float]
-
-    @property
-    def ratio(self) -> float:
-        """T2 over what chance reaches."""
-        return self.statistic / max(self.chance, 1e-9)
 
     @property
     def in_order(self) -> bool:
@@ -777,7 +770,7 @@ def _groups(problem: _Problem, second: BoolArray) -> tuple[FloatArray, FloatArra
     return S, b, np.asarray(d, dtype=np.float64)
 
 
-def _reassigned(problem: _Problem, second: BoolArray, least: int = _LEAST) -> BoolArray:
+def _reassigned(problem: _Problem, second: BoolArray, least: int) -> BoolArray:
     """Divisions (T, N) after moving every view to the camera that suits it until nothing moves.
 
     Each camera keeps `least` views.
@@ -867,12 +860,7 @@ def _sturdy(problem: _Problem, search: Callable[[_Problem], FloatArray]) -> Floa
 
 
 def _described(
-    problem: _Problem,
-    scale: FloatArray,
-    calibration: Calibration,
-    second: BoolArray,
-    statistic: float,
-    chance: float,
+    problem: _Problem, scale: FloatArray, calibration: Calibration, second: BoolArray, ratio: float
 ) -> Split:
     _, fall, phi2 = (float(value[0]) for value in _statistic(problem, second[None]))
     S, _, d = _groups(problem, second[None])
@@ -886,9 +874,7 @@ def _described(
     names = calibration.free_names
     return Split(
         second,
-        statistic,
-        chance,
-        calibration.rms_px,
+        ratio,
         float(np.sqrt(max(problem.cost - fall, 0.0) * variance / points)),
         apart_px(calibration, difference),
         dict(zip(names, difference.tolist(), strict=True)),
@@ -946,7 +932,8 @@ def best_split(calibration: Calibration) -> Split | None:
     best, k = divisions[ordered], int(ordered)
     if not ordered and best.sum() > len(best) / 2:
         best = ~best
-    return _described(problem, scale, calibration, best, float(statistics[k]), float(chances[k]))
+    ratio = float(statistics[k]) / max(float(chances[k]), 1e-9)
+    return _described(problem, scale, calibration, best, ratio)
 
 
 # ----------------------------------------------------------------------

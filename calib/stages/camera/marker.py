@@ -43,6 +43,9 @@ _LEAST_PIXELS = 12
 _COARSE_PX = 400
 """Width from which on the search is done at half the size."""
 _RAYS = 64
+_ANGLES = 2 * np.pi * np.arange(_RAYS) / _RAYS
+_TOWARDS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+"""Directions (64, 2) of the rays."""
 _STEP_PX = 0.5
 _ABOUT_PX = 1.5
 """Of a ray, to each side of its crossing, over which the edge is measured: about its blur."""
@@ -212,10 +215,8 @@ def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray
     reach = 1.6 * radius + 3.0
     if not (0 <= centre[0] < width and 0 <= centre[1] < height and reach < max(width, height)):
         return None
-    angle = 2 * np.pi * np.arange(_RAYS) / _RAYS
-    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     r = np.arange(0.0, reach, _STEP_PX)
-    where = (centre + r[:, None] * towards[:, None]).astype(np.float32)
+    where = (centre + r[:, None] * _TOWARDS[:, None]).astype(np.float32)
     colours = cv2.remap(bgr, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     colours = _LIGHT[colours]
     within = r < 0.5 * radius
@@ -237,9 +238,8 @@ def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray
     k += np.abs(a[i, k + 1] - 0.5) < np.abs(a[i, k] - 0.5)
     k = np.clip(k, n, len(r) - 1 - n)
     window = np.clip(a[i[:, None], k[:, None] + np.arange(-n, n + 1)], -0.25, 1.25)
-    area = _STEP_PX * (window.sum(axis=1) - 0.5 * (window[:, 0] + window[:, -1]))
-    at = r[k] - _ABOUT_PX + area
-    points = centre + at[:, None] * towards
+    at = r[k] - _ABOUT_PX + np.trapezoid(window, dx=_STEP_PX, axis=1)
+    points = centre + at[:, None] * _TOWARDS
     there &= ((points > 0) & (points < [width - 1, height - 1])).all(axis=1)
     return points, np.asarray(there)
 
@@ -316,12 +316,10 @@ def disc_centre(
     radius_m : of the disc.
     to_world, to_pixels : between pixels (n, 2) and places on the plane (n, 2), metres.
     """
-    phi = 2 * np.pi * np.arange(_RAYS) / _RAYS
-    rim = radius_m * np.stack([np.cos(phi), np.sin(phi)], axis=1)
     guess = ellipse_px
     for _ in range(2):
         place = to_world(guess[None])[0]
-        fitted = _ellipse(to_pixels(place + rim), np.ones(_RAYS, dtype=np.bool_))
+        fitted = _ellipse(to_pixels(place + radius_m * _TOWARDS), np.ones(_RAYS, dtype=np.bool_))
         if fitted is None:
             return np.full(2, np.nan)
         guess = ellipse_px - (fitted.centre_px - to_pixels(place[None])[0])

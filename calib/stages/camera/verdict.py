@@ -612,8 +612,8 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
     )
     sure = (
         f"({by}; {strongest.removesuffix('_px')} by {shift[strongest]:.0f} standard deviations; directions "
-        f"by {found.apart_px:.1f} px; the RMS falls from {found.rms_px:.3f} to {found.split_rms_px:.3f} px, "
-        f"{found.ratio:.1f} times what chance explains)"
+        f"by {found.apart_px:.1f} px; the RMS falls from {calibration.rms_px:.3f} to "
+        f"{found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance explains)"
     )
     second = listed([names[i] for i in np.flatnonzero(found.second)], 20)
     if not telling:
