@@ -29,12 +29,13 @@ from calib.stages.actuator.identify import (
     held_back,
     jacobian,
     judge,
+    made,
     own_delays,
     prospects,
     pump_delay,
     residuals,
     solve,
-    starts_of,
+    start_of,
     uncertainty,
     values_of,
 )
@@ -58,7 +59,7 @@ TRUTH = {
 
 def test_swings_without_noise_give_the_truth() -> None:
     tracks = [track("free", TRUTH, phi, noise=0.0) for phi in (0.5, -0.35)]
-    found = fit_tracks(Machine(), tracks, threads=1)
+    found = fit_tracks(Machine(), tracks)
     for name, value in TRUTH.items():
         assert found.values[name] == pytest.approx(value, rel=0.01), name
     assert found.fixed == {"lambda3": "creep lambda2 and creep lambda3 enter only as a product; kept at -1"}
@@ -78,7 +79,7 @@ def test_pumps_without_noise_give_the_truth() -> None:
         track("prbs", truth, noise=0.1, duration_s=8.0),
         track("steps", truth, noise=0.1, duration_s=8.0),
     ]
-    found = fit_tracks(Machine(), tracks, threads=1)
+    found = fit_tracks(Machine(), tracks)
     for name, value in truth.items():
         assert found.values[name] == pytest.approx(value, rel=0.03), name
 
@@ -90,14 +91,14 @@ def test_another_thing_in_place_of_the_marker_does_not_pull() -> None:
         head = one.head.copy()
         head[np.random.default_rng(seed).integers(0, len(head), 5)] += [0.3, 0.01]
         tracks.append(replace(one, head=head))
-    found = fit_tracks(Machine(), tracks, threads=1)
+    found = fit_tracks(Machine(), tracks)
     assert found.values["stiffness_scale"] == pytest.approx(1.15, rel=0.02)
     assert found.values["damping_scale_free_swing"] == pytest.approx(2.8, rel=0.05)
 
 
 def test_what_a_log_cannot_tell_is_named_and_fixed() -> None:
     """Two pumps alike never bend the rig, so nothing is said about bending."""
-    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)], threads=1)
+    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)])
     assert "bending_N_per_rad2" not in found.values
     assert "the logs" in found.fixed["bending_N_per_rad2"]
     assert "lag_s" in found.values
@@ -106,16 +107,16 @@ def test_what_a_log_cannot_tell_is_named_and_fixed() -> None:
 def test_what_a_person_states_is_fixed_or_a_prior() -> None:
     tracks = [track("free", TRUTH, phi, seed=k) for k, phi in enumerate((0.5, -0.35))]
     nominal = replace(Machine(), plant=replace(Machine().plant, stiffness_scale=1.15))
-    fixed = fit_tracks(nominal, tracks, threads=1, stated={"stiffness_scale": 0.0})
+    fixed = fit_tracks(nominal, tracks, stated={"stiffness_scale": 0.0})
     assert "stiffness_scale" not in fixed.values and "stiffness_scale" not in fixed.fixed
     free, tight = (
-        uncertainty(fit_tracks(nominal, tracks, threads=1, stated={"stiffness_scale": sigma})).sigma
+        uncertainty(fit_tracks(nominal, tracks, stated={"stiffness_scale": sigma})).sigma
         for sigma in (10.0, 1e-5)
     )
     assert tight["stiffness_scale"] == pytest.approx(1e-5, rel=0.02)
     assert tight["stiffness_scale"] < 0.1 * free["stiffness_scale"]
     # A swing tells ratios to the moment of inertia, of which the mass makes m l0^2 / 4.
-    doubt = fit_tracks(nominal, tracks, threads=1, stated={"mass_kg": 0.05 * 0.0166})
+    doubt = fit_tracks(nominal, tracks, stated={"mass_kg": 0.05 * 0.0166})
     table = uncertainty(doubt)
     assert table.sigma["mass_kg"] == pytest.approx(0.05 * 0.0166, rel=0.05)
     turning = 0.25 * nominal.plant.mass_kg * nominal.plant.rest_length_m**2
@@ -138,7 +139,7 @@ NAMES = (
 
 def _problem() -> Problem:
     tracks = [track("free", duration_s=1.5), track("prbs", duration_s=1.5), track("steps", duration_s=1.5)]
-    return Problem(Machine(), tracks, NAMES, {}, threads=1)
+    return Problem(Machine(), tracks, NAMES, {})
 
 
 def test_derivatives_are_those_of_the_residuals() -> None:
@@ -176,14 +177,14 @@ def test_a_log_in_motion_has_its_start_among_the_unknowns() -> None:
     moving = Start(0.1, 0.07, -0.5, 0.01, 0.02, -0.01, 0.5, 0.3, 0.4, 0.2)
     tracks = [track("free", duration_s=1.5), _cut(track("prbs", duration_s=2.5), 1.0, moving)]
     free = _cut(track("free", duration_s=2.5), 0.5, Start(0.1, 0.065, -2.0))
-    problem = Problem(Machine(), [*tracks, free], NAMES, {}, threads=1)
+    problem = Problem(Machine(), [*tracks, free], NAMES, {})
     unknowns = problem.unknowns
     first = unknowns.starts[0].start
     assert [at.start - first for at in unknowns.starts] == [0, 2, 12]
     assert unknowns.size == first + 18
     x = first_guess(problem, values_of(Machine()))
-    assert starts_of(problem, x)[1] == moving
-    assert starts_of(problem, x)[2].dphi_radps == -2.0
+    assert start_of(problem, x, 1) == moving
+    assert start_of(problem, x, 2).dphi_radps == -2.0
     x[first:] += 1e-3 * unknowns.scale[first:]
     base, J = jacobian(problem, x)
     assert np.allclose(base, residuals(problem, x[None])[0], atol=1e-6)
@@ -205,13 +206,13 @@ def test_a_log_that_is_cut_out_of_a_longer_one_gives_the_same_parameters() -> No
     guess = start_in_motion(at - 0.025, whole.head[late], True, Machine().plant, SIGMA[0])
     assert guess is not None
     cut = _cut(whole, 4.0, guess)
-    found = fit_tracks(Machine(), [cut], delay_s=0.025, threads=1)
+    found = fit_tracks(Machine(), [cut], delay_s=0.025)
     known = uncertainty(found)
     for name, value in found.values.items():
         truth = values.get(name, values_of(Machine())[name])
         assert abs(value - truth) < 3.5 * known.sigma[name], name
     # Taken to begin at rest, the same rows give another rig.
-    rest = fit_tracks(Machine(), [replace(cut, moving=None)], delay_s=0.025, threads=1)
+    rest = fit_tracks(Machine(), [replace(cut, moving=None)], delay_s=0.025)
     sure = uncertainty(rest)
     away = [abs(v - values.get(n, values_of(Machine())[n])) / sure.sigma[n] for n, v in rest.values.items()]
     assert max(away) > 6.0
@@ -228,7 +229,7 @@ def _coloured(one: Track, seed: int, memory: float = 0.9) -> Track:
 @pytest.fixture(scope="module")
 def solution() -> Solution:
     tracks = [track("free", phi_rad=phi, seed=k) for k, phi in enumerate((0.5, -0.4))]
-    return fit_tracks(Machine(), tracks, threads=1)
+    return fit_tracks(Machine(), tracks)
 
 
 def test_coloured_residuals_raise_the_deviations(solution: Solution) -> None:
@@ -257,7 +258,7 @@ def test_residuals_that_last_for_seconds_count_as_few(
 def test_deviations_are_those_of_repeated_logs() -> None:
     """Of one rig: by what two rigs differ in length at rest and inertia does not scatter from log to log."""
     tracks = [track("free", phi_rad=phi, seed=k) for k, phi in enumerate((0.5, -0.4))]
-    solution = fit_tracks(Machine(), tracks, threads=1, stated={"rest_length_m": 0.0, "inertia_kgm2": 0.0})
+    solution = fit_tracks(Machine(), tracks, stated={"rest_length_m": 0.0, "inertia_kgm2": 0.0})
     found = []
     for seed in range(12):
         tracks = [track("free", phi_rad=phi, seed=50 + 2 * seed + k) for k, phi in enumerate((0.5, -0.4))]
@@ -279,7 +280,7 @@ def test_a_creep_that_is_not_there_is_left_at_none(tmp_path: Path) -> None:
         for k, phi in enumerate(("0.5", "-0.4")):
             path = log_file(tmp_path / f"{k}.csv", rig, "swing", 10 * seed + k, 8.0, phi_rad=phi)
             tracks.append(read_track(Files((path,), rig_yaml), path, known, Machine(), PoseOptions()))
-        found = fit_tracks(Machine(), tracks, threads=1)
+        found = fit_tracks(Machine(), tracks)
         assert {**found.problem.held, **found.values}["lambda2_N_per_m"] < 0.2
         sigma = uncertainty(found).sigma
         for name in ("stiffness_scale", "damping_scale_free_swing", "bending_N_per_rad2", "rest_length_m"):
@@ -302,7 +303,7 @@ def test_a_log_of_another_plant_is_contradicted_and_one_that_tells_more_is_not(
 ) -> None:
     """Steps of both pumps alike move the length, so that they leave the angle of a prbs open by 5 mrad."""
     names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "falling_N_per_s")
-    problem = Problem(Machine(), [track("prbs"), track("steps", other, seed=1)], names, {}, threads=1)
+    problem = Problem(Machine(), [track("prbs"), track("steps", other, seed=1)], names, {})
     x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
     found = Solution(problem, x, residual, J, cost, {}, 1, 1)
     held = held_back(found)
@@ -324,7 +325,7 @@ def test_commands_of_one_pump_that_come_late_are_named(ticks: int) -> None:
         at = np.maximum(np.arange(len(pwm)) - abs(ticks), 0)
         pwm[:, pump] = one.pwm[at, pump]
         tracks.append(replace(one, pwm=pwm))
-    problem = Problem(Machine(), tracks, names, {}, threads=1)
+    problem = Problem(Machine(), tracks, names, {})
     x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
     found = Solution(problem, x, residual, J, cost, {}, 1, 1)
     delay = pump_delay(found)
@@ -344,7 +345,7 @@ def test_commands_of_one_pump_that_come_late_are_named(ticks: int) -> None:
 def test_pictures_late_in_one_log_alone_are_named(late_s: float) -> None:
     names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s")
     tracks = [track("prbs"), track("steps", delay_s=0.025 + late_s)]
-    problem = Problem(Machine(), tracks, names, {}, threads=1)
+    problem = Problem(Machine(), tracks, names, {})
     x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
     found = Solution(problem, x, residual, J, cost, {}, 1, 1)
     apart = {name: late / sigma for name, late, sigma in own_delays(found)}
@@ -446,10 +447,10 @@ def test_a_play_is_found_where_there_is_one(play: dict[str, float], tmp_path: Pa
 def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
     one = track(kind, noise=0.0)
     start = Start(0.5 if kind == "free" else 0.0, 0.065)
-    head, rate = heads_of(one, Machine(), [{}], [start], 0.025)
+    head, rate = heads_of(one, [made(Machine(), {}, one.hoses, one.tick_s)], [start], 0.025)
     # The track's own values lie on straight lines between steps of 1.7 ms.
     assert np.abs(head[0] - one.head).max() < 3e-4
-    later, _ = heads_of(one, Machine(), [{}], [start], 0.026)
+    later, _ = heads_of(one, [made(Machine(), {}, one.hoses, one.tick_s)], [start], 0.026)
     moved = (head - later) / 1e-3
     inner = (one.t_s > 0.1) & (one.t_s < one.t_s[-1] - 0.1)
     assert np.abs(moved - rate)[0, inner].max() < 0.05 * np.abs(rate).max()
@@ -457,7 +458,7 @@ def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
 
 def test_experiments_shrink_and_rest_does_not() -> None:
     tracks = [track("free", phi_rad=p, seed=k) for k, p in enumerate((0.5, -0.4))]
-    found = fit_tracks(Machine(), tracks, threads=1, stated={"rest_length_m": 0.0})
+    found = fit_tracks(Machine(), tracks, stated={"rest_length_m": 0.0})
     known = uncertainty(found)
     ahead = {p.name: p for p in prospects(found, known)}
     for name, value in found.values.items():
@@ -470,7 +471,7 @@ def test_experiments_shrink_and_rest_does_not() -> None:
 
 
 def test_what_could_not_be_told_is_what_is_asked_for() -> None:
-    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)], threads=1)
+    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)])
     best = prospects(found, uncertainty(found))[0]
     assert best.name in ("swing", "step", "ellipse")
     assert best.relative["bending_N_per_rad2"] < 0.2

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from calib.solve.groups import tied_groups
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
-from calib.stages.actuator.section import CREEP, label_of
+from calib.stages.actuator.section import CREEP, KNOTS, label_of
 from calib.stages.actuator.simulate import simulate_batch, state_row
 
 # ----------------------------------------------------------------------
@@ -88,7 +90,9 @@ _PLAYS = {
 }
 """Plays of the pumps, and widths from which they are sought."""
 
-_ELONGATIONS = tuple(f"elongation_{volt:g}V_mm" for volt in KNOTS_V)
+_OF_PLANT = ("mass_kg", "inertia_kgm2", "rest_length_m", "stiffness_scale", "bending_N_per_rad2")
+_OF_PUMP = ("lag_s", "play_pwm", "play_N")
+"""Parameters that plant and pumps have by the same names."""
 
 
 @dataclass(frozen=True)
@@ -110,32 +114,19 @@ def elongation_polynomial(elongation_mm: Sequence[float]) -> tuple[float, float,
 
 def values_of(nominal: Machine) -> dict[str, float]:
     """All parameters of a rig by name."""
-    plant, pump = nominal.plant, nominal.pump
-    l1, l2, l3 = plant.creep_rates
-    law = pump.deflation
-    orifice = law if isinstance(law, Orifice) else Orifice()
-    falling = law.falling_N_per_s if isinstance(law, RateLimit) else 0.4
-    knots = np.polyval(pump.static.elongation_mm, KNOTS_V).tolist()
+    plant, pump, law = nominal.plant, nominal.pump, nominal.pump.deflation
+    limit, orifice = (law if isinstance(law, kind) else kind() for kind in (RateLimit, Orifice))
     return {
-        "mass_kg": plant.mass_kg,
-        "inertia_kgm2": plant.inertia_kgm2,
-        "rest_length_m": plant.rest_length_m,
-        "stiffness_scale": plant.stiffness_scale,
+        **{name: getattr(plant, name) for name in _OF_PLANT},
         "damping_scale_free_swing": nominal.free_damping_scale,
         "damping_scale_pumps_connected": plant.damping_scale,
-        "bending_N_per_rad2": plant.bending_N_per_rad2,
-        "lambda1_per_s": l1,
-        "lambda2_N_per_m": l2,
-        "lambda3": l3,
-        "lag_s": pump.lag_s,
+        **dict(zip(CREEP, plant.creep_rates, strict=True)),
+        **{name: getattr(pump, name) for name in _OF_PUMP},
         "strength1": nominal.strength[0],
         "strength2": nominal.strength[1],
-        "falling_N_per_s": falling,
-        "laminar_s": orifice.laminar_s,
-        "turbulent_s2_per_N": orifice.turbulent_s2_per_N,
-        "play_pwm": pump.play_pwm,
-        "play_N": pump.play_N,
-        **dict(zip(_ELONGATIONS, knots, strict=True)),
+        **vars(limit),
+        **vars(orifice),
+        **dict(zip(KNOTS, np.polyval(pump.static.elongation_mm, KNOTS_V).tolist(), strict=True)),
     }
 
 
@@ -156,7 +147,7 @@ def candidates(
     names = [name for name, spec in PARAMETERS.items() if spec.acts in wanted and stated.get(name) != 0.0]
     orifice = isinstance(nominal.pump.deflation, Orifice)
     left_out = {"falling_N_per_s"} if orifice else {"laminar_s", "turbulent_s2_per_N"}
-    left_out |= {"strength1"} if static_map else set(_ELONGATIONS)
+    left_out |= {"strength1"} if static_map else set(KNOTS)
     # A play is looked for where a rig without one leaves the logs unexplained.
     left_out |= {name for name in _PLAYS if not getattr(nominal.pump, name) > 0.0}
     return tuple(name for name in names if name not in left_out)
@@ -171,37 +162,25 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
     hoses : whether the pumps are connected, which decides on the damping.
     """
     v = {**values_of(nominal), **values}
-    plant = nominal.plant
-    plant = replace(
-        plant,
-        mass_kg=v["mass_kg"],
-        inertia_kgm2=v["inertia_kgm2"],
-        rest_length_m=v["rest_length_m"],
-        stiffness_scale=v["stiffness_scale"],
-        damping_scale=v["damping_scale_pumps_connected" if hoses else "damping_scale_free_swing"],
-        bending_N_per_rad2=v["bending_N_per_rad2"],
-        creep=Creep(v["lambda1_per_s"], v["lambda2_N_per_m"], v["lambda3"]),
-    )
-    static = nominal.pump.static
-    law = nominal.pump.deflation
+    static, law = nominal.pump.static, nominal.pump.deflation
     curve = static.elongation_mm
-    if any(name in values for name in _ELONGATIONS):
-        curve = elongation_polynomial([v[name] for name in _ELONGATIONS])
-    deflation = (
-        RateLimit(v["falling_N_per_s"])
-        if isinstance(law, RateLimit)
-        else Orifice(v["laminar_s"], v["turbulent_s2_per_N"])
-    )
-    force = StrengthForce(
-        curve, static.stiffness, static.supply_V, static.dead_zone_V, (v["strength1"], v["strength2"])
+    if any(name in values for name in KNOTS):
+        curve = elongation_polynomial([v[name] for name in KNOTS])
+    of_plant: dict[str, Any] = {name: v[name] for name in _OF_PLANT}
+    of_pump: dict[str, Any] = {name: v[name] for name in _OF_PUMP}
+    plant = replace(
+        nominal.plant,
+        **of_plant,
+        damping_scale=v["damping_scale_pumps_connected" if hoses else "damping_scale_free_swing"],
+        creep=Creep(*(v[name] for name in CREEP)),
     )
     pump = replace(
         nominal.pump,
-        static=force,
-        deflation=deflation,
-        lag_s=v["lag_s"],
-        play_pwm=v["play_pwm"],
-        play_N=v["play_N"],
+        **of_pump,
+        static=StrengthForce(
+            curve, static.stiffness, static.supply_V, static.dead_zone_V, (v["strength1"], v["strength2"])
+        ),
+        deflation=type(law)(**{name: v[name] for name in vars(law)}),
         tick_s=tick_s,
     )
     return plant, pump
@@ -309,43 +288,35 @@ class Track:
 
 def heads_of(
     track: Track,
-    nominal: Machine,
-    sets: Sequence[Mapping[str, float]],
+    pairs: Sequence[tuple[Plant, Pump]],
     starts: Sequence[Start],
     delay_s: float,
-    threads: int = 2,
-    pairs: Sequence[tuple[Plant, Pump]] | None = None,
     per_tick: int = SUBSTEPS,
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle and length at the track's rows, and their rates, for sets of parameters: (sets, m, 2) each.
+    """Angle and length at the track's rows, and their rates, of plants with pumps: (pairs, m, 2) each.
 
     Parameters
     ----------
-    delay_s : the rows show the head as it was this much earlier.
-    pairs : plants and pumps of the sets, where they have been made before.
+    starts : of each pair. delay_s : the rows show the head as it was this much earlier.
     per_tick : steps in 1/60 s.
 
-    A set whose motion leaves the model is NaN.
+    A pair whose motion leaves the model is NaN.
     """
-    if pairs is None:
-        pairs = [made(nominal, values, track.hoses, track.tick_s) for values in sets]
-    r, pwm = nominal.plant.bellows_radius_m, track.pwm
+    r, pwm = pairs[0][0].bellows_radius_m, track.pwm
     if track.moving is not None:
         # The batch knows no commands before the first; those on their way are put in by hand.
-        late = np.maximum(np.arange(len(pwm)) - nominal.pump.delay_ticks, 0)
+        late = np.maximum(np.arange(len(pwm)) - pairs[0][1].delay_ticks, 0)
         pwm, pairs = pwm[late], [(plant, replace(pump, delay_ticks=0)) for plant, pump in pairs]
     rows = np.stack([start.row(plant) for (plant, _), start in zip(pairs, starts, strict=True)])
     last = float(track.t_s[-1] - delay_s)
     ticks = min(max(int(np.ceil(last / track.tick_s)) + 1, 2), len(track.pwm))
     substeps = max(round(per_tick * 60.0 * track.tick_s), 4)
-    states, _ = simulate_batch(
-        [p for p, _ in pairs], [u for _, u in pairs], pwm[:ticks], rows, substeps, threads
-    )
+    states, _ = simulate_batch([p for p, _ in pairs], [u for _, u in pairs], pwm[:ticks], rows, substeps)
     states = np.concatenate([rows[:, None, :], states], axis=1)
     half = 0.5 / r
-    y = np.stack([(states[..., 0] - states[..., 1]) * half, 0.5 * (states[..., 0] + states[..., 1])], axis=-1)
-    dy = np.stack(
-        [(states[..., 2] - states[..., 3]) * half, 0.5 * (states[..., 2] + states[..., 3])], axis=-1
+    y, dy = (
+        np.stack([(one - other) * half, 0.5 * (one + other)], axis=-1)
+        for one, other in (np.moveaxis(states[..., k : k + 2], -1, 0) for k in (0, 2))
     )
     at = np.clip((track.t_s - delay_s) / track.tick_s, 0.0, float(ticks))
     k = np.minimum(at.astype(np.int64), ticks - 1)
@@ -440,7 +411,6 @@ class Problem:
     names: tuple[str, ...]
     held: Mapping[str, float]
     delay_s: float = CAMERA_DELAY_S
-    threads: int = 2
     stated: Mapping[str, float] = field(default_factory=dict)
     rough: bool = False
 
@@ -489,6 +459,16 @@ class Problem:
         """Parameters by name of a vector of unknowns."""
         return {**self.held, **dict(zip(self.names, x[: len(self.names)].tolist(), strict=True))}
 
+    def pair(self, track: Track, values: Mapping[str, float]) -> tuple[Plant, Pump]:
+        """Plant and pumps of a log with some parameters changed."""
+        return made(self.nominal, values, track.hoses, track.tick_s)
+
+    @property
+    def spans(self) -> list[slice]:
+        """Residuals of each log, angle and length of a picture side by side."""
+        ends = np.cumsum([0, *(2 * len(track.t_s) for track in self.tracks)]).tolist()
+        return [slice(begin, end) for begin, end in pairwise(ends)]
+
 
 def first_guess(problem: Problem, values: Mapping[str, float]) -> FloatArray:
     """Unknowns with these parameters, offsets zero, usual delays, and starts as they were measured."""
@@ -497,9 +477,17 @@ def first_guess(problem: Problem, values: Mapping[str, float]) -> FloatArray:
     return x
 
 
-def starts_of(problem: Problem, x: FloatArray) -> list[Start]:
-    """Starts of all logs in a vector of unknowns."""
-    return [Start(*x[at].tolist()) for at in problem.unknowns.starts]
+def start_of(problem: Problem, x: FloatArray, k: int) -> Start:
+    """Start of a log in a vector of unknowns."""
+    return Start(*x[problem.unknowns.starts[k]].tolist())
+
+
+def head_of(problem: Problem, x: FloatArray, k: int, track: Track | None = None) -> FloatArray:
+    """Angle and length (m, 2) at a log's rows, or at those of a track in its place, without the offsets."""
+    track = problem.tracks[k] if track is None else track
+    delay_s = float(x[problem.unknowns.delays[k]])
+    head, _ = heads_of(track, [problem.pair(track, problem.values(x))], [start_of(problem, x, k)], delay_s)
+    return np.asarray(head[0])
 
 
 def _whitened(track: Track, error: FloatArray) -> FloatArray:
@@ -519,13 +507,12 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
     unknowns, parts = problem.unknowns, []
     values = [problem.values(x) for x in xs]
     for k, track in enumerate(problem.tracks):
-        starts = [starts_of(problem, x)[k] for x in xs]
+        pairs = [problem.pair(track, one) for one in values]
+        starts = [start_of(problem, x, k) for x in xs]
         delay = unknowns.delays[k]
         # Candidates of one batch may differ in their delay; rates shift them to their own.
         middle = float(np.mean(xs[:, delay]))
-        head, rate = heads_of(
-            track, problem.nominal, values, starts, middle, problem.threads, per_tick=problem.per_tick
-        )
+        head, rate = heads_of(track, pairs, starts, middle, problem.per_tick)
         if np.ptp(xs[:, delay]) > 0.0:
             head = head - rate * (xs[:, delay] - middle)[:, None, None]
         error = track.head - head - xs[:, None, unknowns.offset]
@@ -554,20 +541,17 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     alike: dict[tuple[bool, float], list[tuple[Plant, Pump]]] = {}
     blocks, errors = [], []
     for k, track in enumerate(problem.tracks):
-        begin = starts_of(problem, x)[k]
-        sets, starts = list(moved), [begin] * len(moved)
+        begin = start_of(problem, x, k)
         kind = track.hoses, track.tick_s
         if kind not in alike:
-            alike[kind] = [made(problem.nominal, values, *kind) for values in moved]
+            alike[kind] = [problem.pair(track, values) for values in moved]
+        pairs, starts = alike[kind], [begin] * len(moved)
         count = len(track.unknown)
         for name, step in zip(track.unknown, _START_STEP, strict=False):
-            sets += [base] * len(sides)
             starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in sides]
         delay = unknowns.delays[k]
-        pairs = [*alike[kind], *[alike[kind][0]] * (len(sets) - len(moved))]
-        head, rate = heads_of(
-            track, problem.nominal, sets, starts, float(x[delay]), problem.threads, pairs, problem.per_tick
-        )
+        pairs = pairs + pairs[:1] * (len(starts) - len(pairs))
+        head, rate = heads_of(track, pairs, starts, float(x[delay]), problem.per_tick)
         W = track.whitening
         J = np.zeros((len(track.t_s), 2, unknowns.size))
         moved_to, moved_from = (head[1:], head[:1]) if problem.rough else (head[1::2], head[2::2])
@@ -681,17 +665,16 @@ def _compressed(problem: Problem, residual: FloatArray, J: FloatArray) -> tuple[
     return root[:, -1], root[:, :-1]
 
 
+_Minimum = tuple[FloatArray, float, FloatArray, FloatArray]
+"""Unknowns, robust cost, residuals and derivatives."""
+
+
 class _Enough(Exception):
     """A search has come as far as it was asked to."""
 
 
-def solve(
-    problem: Problem, x: FloatArray, most: int = 30, enough: float = -math.inf
-) -> tuple[FloatArray, float, FloatArray, FloatArray]:
-    """A minimum near x, or the first point of a cost below `enough`.
-
-    Returns unknowns, robust cost, residuals and derivatives there.
-    """
+def solve(problem: Problem, x: FloatArray, most: int = 30, enough: float = -math.inf) -> _Minimum:
+    """A minimum near x, or the first point of a cost below `enough`."""
     from scipy.optimize import least_squares
 
     unknowns = problem.unknowns
@@ -846,7 +829,6 @@ def fit_tracks(
     tracks: Sequence[Track],
     static_map: bool = False,
     delay_s: float | None = None,
-    threads: int = 2,
     progress: Progress | None = None,
     stated: Mapping[str, float] | None = None,
     either_law: bool = False,
@@ -877,7 +859,7 @@ def fit_tracks(
     if not any(_moves(track) for track in tracks):
         raise _blind(dict.fromkeys(names, "the rig does not move"))
     known = values_of(nominal)
-    problem = Problem(nominal, tracks, names, {}, threads=threads, stated=stated or {})
+    problem = Problem(nominal, tracks, names, {}, stated=stated or {})
     if delay_s is not None:
         problem = replace(problem, delay_s=delay_s)
     fixed: dict[str, str] = {}
@@ -897,10 +879,6 @@ def fit_tracks(
         first, found = found, _by_the_better_law(found) if either_law else found
         found = _with_play(found) if found is first or not _explained(found) else found
     return _without_creep(found)
-
-
-_Minimum = tuple[FloatArray, float, FloatArray, FloatArray]
-"""As `solve` returns it."""
 
 
 def _all_told(problem: Problem, best: _Minimum, fixed: dict[str, str]) -> tuple[Problem, _Minimum]:
@@ -1041,7 +1019,7 @@ def _without_creep(solution: Solution) -> Solution:
 
 def _search(
     problem: Problem, known: Mapping[str, float], progress: Progress | None
-) -> tuple[tuple[FloatArray, float, FloatArray, FloatArray], int, int]:
+) -> tuple[_Minimum, int, int]:
     """The best of several refined starts, how many agree with it, and of how many."""
     spread, rough = _spread(problem, known), replace(problem, rough=True)
     order = np.argsort(_robust(rough, residuals(rough, spread)), kind="stable")[:_REFINED].tolist()
@@ -1139,15 +1117,7 @@ class HeldLog:
     chance: float
 
 
-def _spans(tracks: Sequence[Track]) -> list[slice]:
-    out, at = [], 0
-    for track in tracks:
-        out.append(slice(at, at + 2 * len(track.t_s)))
-        at += 2 * len(track.t_s)
-    return out
-
-
-def _autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
+def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     """Of a log's residuals (rows,), of angle and length (lags, 2) from lag 1 on; far ones are cut."""
     r = residual.reshape(-1, 2)
     z = np.clip(r / np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9), -3.0, 3.0)
@@ -1161,7 +1131,7 @@ def uncertainty(solution: Solution) -> Uncertainty:
     problem, r, J = solution.problem, solution.residual, solution.J
     P = len(problem.names)
     w = weights(problem, r)
-    spans = _spans(problem.tracks)
+    spans = problem.spans
     rows = spans[-1].stop
     scale = max(1.4826 * float(np.median(np.abs(r[:rows]))), 1e-9)
     # The prior is known, the scale of the residuals is not.
@@ -1173,7 +1143,7 @@ def uncertainty(solution: Solution) -> Uncertainty:
         g = (J[span] * (w * size * r)[span, None]).reshape(-1, 2, J.shape[1]).sum(axis=1)
         period = float(np.median(np.diff(track.t_s))) if len(track.t_s) > 1 else track.tick_s
         rows_of_s = 1.0 / max(period, 1e-4)
-        c = _autocorrelation(r[span], min(round(_LONGEST_S * rows_of_s), len(g) // 4))
+        c = autocorrelation(r[span], min(round(_LONGEST_S * rows_of_s), len(g) // 4))
         apart = np.flatnonzero((c < _BAND / math.sqrt(len(g))).all(axis=1))
         alike = int(apart[0]) if len(apart) else len(c)
         over = 1 + min(max(round(_SPAN_S * rows_of_s), alike, 1), len(g) // 4)
@@ -1201,10 +1171,10 @@ def colour_of(solution: Solution) -> tuple[Colour, ...]:
     """Whiteness of each log's whitened residuals, rows that are far off cut at three deviations."""
     out = []
     w = weights(solution.problem, solution.residual)
-    for track, span in zip(solution.problem.tracks, _spans(solution.problem.tracks), strict=True):
+    for track, span in zip(solution.problem.tracks, solution.problem.spans, strict=True):
         r = solution.residual[span].reshape(-1, 2)
         far = float(np.mean((w[span].reshape(-1, 2) < 1.0 / 3.0).any(axis=1)))
-        c = _autocorrelation(r, min(_LAGS, max(len(r) - 2, 1)))
+        c = autocorrelation(r, min(_LAGS, max(len(r) - 2, 1)))
         out.append(
             Colour(
                 track.name,
@@ -1219,7 +1189,7 @@ def colour_of(solution: Solution) -> tuple[Colour, ...]:
 def rms_by_track(problem: Problem, residual: FloatArray) -> list[tuple[float, float]]:
     """RMS of angle [rad] and length [m] of each log, rows beyond six deviations left out."""
     out = []
-    for track, span in zip(problem.tracks, _spans(problem.tracks), strict=True):
+    for track, span in zip(problem.tracks, problem.spans, strict=True):
         r = residual[span].reshape(-1, 2)
         size = np.maximum(1.4826 * np.median(np.abs(r)), 1e-9)
         near = (np.abs(r) < 6.0 * size).all(axis=1)
@@ -1270,7 +1240,7 @@ def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
     problem, tracks, J = solution.problem, solution.problem.tracks, solution.J
     u, priors, count = problem.unknowns, problem.unknowns.priors, len(solution.problem.tracks)
     free, kept = np.ones((count, u.size), dtype=bool), np.ones((count, len(J)), dtype=bool)
-    for k, span in enumerate(_spans(tracks)):
+    for k, span in enumerate(problem.spans):
         kinds = {track.hoses for i, track in enumerate(tracks) if i != k}
         free[k, : len(problem.names)] = [_told_by(name, kinds) for name in problem.names]
         free[k, u.starts[k]] = False
@@ -1662,7 +1632,7 @@ def _information(
     W = np.broadcast_to(np.diag(1.0 / noise), (n - 1, 2, 2)).copy()
     track = Track(one.name, tick_s, one.pwm, one.hoses, t, np.zeros((n - 1, 2)), W)
     try:
-        head, _ = heads_of(track, problem.nominal, [values], [one.start], 0.0, problem.threads)
+        head, _ = heads_of(track, [problem.pair(track, values)], [one.start], 0.0)
     except BadInputError:
         return None
     if not np.isfinite(head).all():
@@ -1818,7 +1788,7 @@ def own_delays(solution: Solution) -> list[tuple[str, float, float]]:
     between, and for a damping and a creep that are not there.
     """
     problem, J = solution.problem, solution.J
-    delays, spans = problem.unknowns.delays, _spans(problem.tracks)
+    delays, spans = problem.unknowns.delays, problem.spans
     shared = [k for k, at in enumerate(delays) if delays.count(at) > 1]
     columns = []
     for k in shared:
@@ -1836,18 +1806,13 @@ def pump_delay(solution: Solution) -> tuple[float, float] | None:
     """
     problem, x = solution.problem, solution.x
     column = np.zeros(len(solution.residual))
-    starts, values = starts_of(problem, x), problem.values(x)
-    for k, (track, span) in enumerate(zip(problem.tracks, _spans(problem.tracks), strict=True)):
+    for k, (track, span) in enumerate(zip(problem.tracks, problem.spans, strict=True)):
         if track.hoses:
             n, ends = len(track.pwm), []
             for shift in (1, -1):
                 pwm = track.pwm.copy()
                 pwm[:, 0] = track.pwm[np.clip(np.arange(n) + shift, 0, n - 1), 0]
-                head, _ = heads_of(
-                    replace(track, pwm=pwm), problem.nominal, [values], [starts[k]],
-                    float(x[problem.unknowns.delays[k]]), problem.threads,
-                )  # fmt: skip
-                ends.append(head[0])
+                ends.append(head_of(problem, x, k, replace(track, pwm=pwm)))
             slope = (ends[0] - ends[1]) / (2.0 * track.tick_s)
             column[span] = -_whitened(track, slope).reshape(-1)
     return next(iter(_one_more(solution, [column]))) if np.isfinite(column).all() and column.any() else None

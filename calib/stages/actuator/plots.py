@@ -23,7 +23,7 @@ from calib.core.plot import (
     number,
     short,
 )
-from calib.stages.actuator.identify import PARAMETERS
+from calib.stages.actuator.identify import PARAMETERS, autocorrelation
 from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound
 from calib.stages.actuator.results import Identified, simulated_heads
 from calib.stages.actuator.section import Actuator, PumpSection
@@ -94,15 +94,12 @@ def _residuals(result: Identified) -> Figure:
         "after: white ones stay within the grey band (95 %). On the right is their distribution beside a "
         "normal one."
     )
-    at, rows, lags = 0, [], np.arange(1, _LAGS)
+    rows, lags = [], np.arange(1, _LAGS)
     marks: list[Mark] = []
-    for track in result.solution.problem.tracks:
-        r = result.solution.residual[at : at + 2 * len(track.t_s)].reshape(-1, 2)
-        at += 2 * len(track.t_s)
+    for span in result.solution.problem.spans:
+        residual = result.solution.residual[span]
+        r, c = residual.reshape(-1, 2), autocorrelation(residual, _LAGS - 1)
         rows.append(r / np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9))
-        cut = np.clip(rows[-1], -3.0, 3.0)
-        cut = cut - cut.mean(axis=0)
-        c = np.array([np.sum(cut[k:] * cut[:-k], axis=0) for k in lags]) / np.sum(cut * cut, axis=0)
         marks.append(Curve(lags, c[:, 0], "first component", size=0.8))
         marks.append(Curve(lags, c[:, 1], "second component", colour="orange", size=0.8))
     white = 1.96 / np.sqrt(min(len(z) for z in rows))

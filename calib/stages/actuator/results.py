@@ -29,13 +29,12 @@ from calib.stages.actuator.identify import (
     decrement,
     elongation_polynomial,
     fit_tracks,
-    heads_of,
+    head_of,
     held_back,
     judge,
     prospects,
     rms_by_track,
     scaled_inverse,
-    starts_of,
     uncertainty,
     values_of,
 )
@@ -104,16 +103,8 @@ _OF_TABLES = ("tick_s", "supply_V", "dead_zone_V")
 
 def simulated_heads(solution: Solution) -> list[FloatArray]:
     """Angle [rad] and length [m] (m, 2) of the identified rig at each log's poses, the offsets with them."""
-    problem = solution.problem
-    unknowns, starts = problem.unknowns, starts_of(problem, solution.x)
-    out = []
-    for k, track in enumerate(problem.tracks):
-        delay = float(solution.x[unknowns.delays[k]])
-        head, _ = heads_of(
-            track, problem.nominal, [problem.values(solution.x)], [starts[k]], delay, problem.threads
-        )
-        out.append(np.asarray(head[0] + solution.x[unknowns.offset]))
-    return out
+    problem, x = solution.problem, solution.x
+    return [head_of(problem, x, k) + x[problem.unknowns.offset] for k in range(len(problem.tracks))]
 
 
 def _decrements(solution: Solution) -> dict[str, tuple[Decrement, float | None]]:

@@ -29,7 +29,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.options import LogOptions, PoseOptions
 from calib.core.rig import Rig
-from calib.stages.actuator.identify import Start, Track, heads_of, without_outliers
+from calib.stages.actuator.identify import Start, Track, heads_of, made, without_outliers
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.read import held_by_pumps, read_track
@@ -162,7 +162,8 @@ def compare(track: Track, models: Mapping[str, Machine], start: Start | None = N
     for name, nominal in models.items():
         begun = _begun(track, begin, nominal)
         at = begin if begun.moving is None else begun.moving
-        head, _ = heads_of(begun, nominal, [{}], [at], track.delay_s, threads=1)
+        pair = made(nominal, {}, begun.hoses, begun.tick_s)
+        head, _ = heads_of(begun, [pair], [at], track.delay_s)
         simulated[name] = _columns(head[0], nominal.plant.bellows_radius_m)
     errors = {name: errors_of(measured, curves) for name, curves in simulated.items()}
     return Comparison(
