@@ -23,7 +23,7 @@ from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import TICK_S
 from calib.stages.control.laws import holding_force
 from calib.stages.estimator.read import periods, setup_from_rig
-from calib.stages.estimator.sensors import SIZE, invert_marker, marker
+from calib.stages.estimator.sensors import GRAVITY_MPS2, SIZE, heads_seen, marker
 
 if TYPE_CHECKING:
     from calib.core.stage import Files
@@ -255,7 +255,6 @@ _MOST_TICKS = 10_000_000
 _LATE_S = 0.01
 _TRUE_SIGMA = (1e-4, 1e-5)
 _LENGTH_SIGMA_M = 2e-4
-_GRAVITY_MPS2 = 9.81
 
 Head = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -280,27 +279,19 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path, rest: float) -> tuple[Hea
     state[6:] = sensor
     state[13] = 0.0
     sigma = math.sqrt(float(setup.noise[0]) ** 2 + float(setup.noise[1]) ** 2 / 12.0)
-    guess = (0.0, rest)
-    t, heads, whitening = [], [], []
-    for at, (u, v) in zip(pictures.t_s.tolist(), pictures.values.tolist(), strict=True):
-        for phi, length in (guess, (0.0, rest)):
-            phi, length, good = invert_marker(setup.view, sensor, u, v, phi, length)
-            if good:
-                break
-        if not good:
-            continue
-        guess = phi, length
-        state[0], state[1] = phi, length
+    seen = heads_seen(setup.view, sensor, pictures.values, rest)
+    found_at = np.isfinite(seen[:, 0])
+    t, heads, whitening = pictures.t_s[found_at], seen[found_at], np.empty((int(found_at.sum()), 2, 2))
+    for k, head in enumerate(heads):
+        state[:2] = head
         marker(setup.view, state, by_u, by_v)
-        t.append(at)
-        heads.append(guess)
-        whitening.append([by_u[:2] / sigma, by_v[:2] / sigma])
+        whitening[k] = by_u[:2] / sigma, by_v[:2] / sigma
     if len(t) < _IDENTIFYING_FEWEST:
         raise BadInputError(
             f"{log.source}: {len(t)} of {len(pictures)} pictures show the marker where it can be, "
             f"expected at least {_IDENTIFYING_FEWEST}"
         )
-    return (np.array(t), np.array(heads), np.array(whitening)), delay_s
+    return (t, heads, whitening), delay_s
 
 
 def _from_states(path: Path) -> Head:
@@ -494,7 +485,7 @@ def read_track(
 
 
 _LENGTHS = {"elongation_mm": 1e-3, "displacement_mm": 1e-3, "elongation_m": 1.0, "displacement_m": 1.0}
-_LOADS = {"force_n": 1.0, "force_mn": 1e-3, "mass_kg": _GRAVITY_MPS2, "mass_g": 1e-3 * _GRAVITY_MPS2}
+_LOADS = {"force_n": 1.0, "force_mn": 1e-3, "mass_kg": GRAVITY_MPS2, "mass_g": 1e-3 * GRAVITY_MPS2}
 
 
 def read_displacements(path: Path) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.stage import Progress
     from calib.stages.actuator.identify import Start, StiffnessFit, Track
-    from calib.stages.actuator.identify_pump import PumpFound, PumpTable
+    from calib.stages.actuator.identify_pump import Held, PumpFound, PumpTable
     from calib.stages.actuator.machine import Machine
     from calib.stages.actuator.results import Identified
     from calib.stages.actuator.section import Actuator, PumpSection
@@ -269,12 +269,7 @@ def _pump_words(section: PumpSection) -> list[Block]:
         blocks.append(Table((model, "value", "sigma", "unit"), tuple(rows)))
     columns = (*models, *(f"{model}, 0.5 s ahead" for model in models))
     if models:
-        held = {model: {one.name: one for one in found.held[model]} for model in models}
-        errors = []
-        for record in found.records:
-            row = [held[model].get(record.name) for model in models]
-            cells = [_cell(None if one is None else one.rms) for one in row]
-            errors.append((record.name, *cells, *(_cell(None if one is None else one.ahead) for one in row)))
+        errors = [_errors_on(record.name, found.held) for record in found.records]
         blank, main = ("",) * len(models), found.main_group
         if main is not None:
             ends = (_cell(found.held_rms(model, main.files)) for model in models)
@@ -283,12 +278,8 @@ def _pump_words(section: PumpSection) -> list[Block]:
         blocks.append(Table((f"RMS on files not fitted, {unit}", *columns), tuple(errors)))
         how = "simulated from a file's PWM and its first 0.2 s, which give the start; the extras of a model"
         blocks.append(Line(f"{how} are chosen once, on all files"))
-    asked = {model: {one.name: one for one in found.asked[model]} for model in models}
-    if models and asked[models[0]]:
-        told = []
-        for name in asked[models[0]]:
-            kept = [asked[model][name] for model in models]
-            told.append((name, *(_cell(one.rms) for one in kept), *(_cell(one.ahead) for one in kept)))
+    if models and found.asked[models[0]]:
+        told = [_errors_on(one.name, found.asked) for one in found.asked[models[0]]]
         blocks.append(Table((f"RMS on the tables kept out, {unit}", *columns), tuple(told)))
     maps = [
         (
@@ -305,6 +296,13 @@ def _pump_words(section: PumpSection) -> list[Block]:
         head = ("static map", f"at PWM 255, {unit}", "dead zone, PWM", "scale, PWM", "95 % at PWM", "scatter")
         blocks.append(Table(head, tuple(maps)))
     return blocks
+
+
+def _errors_on(name: str, errors: Mapping[str, Sequence[Held]]) -> tuple[str, ...]:
+    """A recording's row: errors of each model, then those ahead."""
+    found = [next((one for one in rows if one.name == name), None) for rows in errors.values()]
+    free = (_cell(None if one is None else one.rms) for one in found)
+    return name, *free, *(_cell(None if one is None else one.ahead) for one in found)
 
 
 pump = Stage(

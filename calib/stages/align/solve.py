@@ -30,7 +30,7 @@ from calib.stages.align.spline import (
     imu_rows,
     normal_sums,
 )
-from calib.stages.estimator.sensors import GRAVITY_MPS2, QUANTITIES, SENSOR, SIZE, invert_marker, truncated
+from calib.stages.estimator.sensors import GRAVITY_MPS2, QUANTITIES, SENSOR, SIZE, heads_seen, truncated
 
 # ----------------------------------------------------------------------
 # How well readings fit: whole pixels with outliers, and readings of the IMU.
@@ -354,6 +354,8 @@ SHORTEST_S = 1.0
 _OFFSETS_S = np.arange(-0.1, 0.3001, 0.0025)
 _LEAST_PICTURES = 20
 _START_LEAST_SAMPLES = 40
+_LENGTH_M = 0.07
+"""Where the search for the length that pictures show begins."""
 _PHI_SIGMA = 0.012
 _WORTH = 60.0
 _TIMES_IN_DEGREES = (0.5 / 57.3, 2.0 / 57.3)
@@ -439,19 +441,6 @@ def _cuts(log: AlignLog) -> list[float]:
     return [-math.inf, *(0.5 * (both[i] + both[i + 1]) for i in gaps.tolist()), math.inf]
 
 
-def _own_angle(view: FloatArray, sensor: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    phi, length = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
-    at = (0.0, 0.07)
-    for n, (u, v) in enumerate(pixels):
-        for guess in (at, (0.0, 0.07)):
-            angle, arc, found = invert_marker(view, sensor, u, v, *guess)
-            if found:
-                phi[n], length[n] = angle, arc
-                at = (angle, arc)
-                break
-    return phi, length
-
-
 def _like_neighbours(phi: FloatArray) -> BoolArray:
     """Pictures whose angle is near the median of five."""
     if len(phi) < 5:
@@ -510,7 +499,7 @@ def pieces_of(
             if min(camera.t_s[-1], imu.t_s[-1]) - max(camera.t_s[0], imu.t_s[0]) < SHORTEST_S:
                 continue
             pixels, readings = log.pixels[seen], log.readings[felt]
-            phi, length = _own_angle(view, sensor, pixels)
+            phi, length = heads_seen(view, sensor, pixels, _LENGTH_M).T.copy()
             theta = _integrated(imu.t_s, readings[:, 2])
             fine = _like_neighbours(phi)
             pieces.append(Piece(number, camera, imu, pixels, readings, phi, length, fine, theta))

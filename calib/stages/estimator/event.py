@@ -25,11 +25,12 @@ from calib.stages.estimator.sensors import GRAVITY_MPS2, accelerometer, gyroscop
 CAMERA, IMU = 1, 2
 """Kinds of events; a picture has the readings (u, v), a sample (a_x, a_y, g_z), NaN where missing."""
 
-NOISE = (
-    "jitter_px", "grid_px", "accel_x_mps2", "accel_y_mps2", "gyro_radps", "accel_share", "camera_stamp_s",
-    "imu_stamp_s", "camera_gate", "accel_gate", "gyro_gate",
-)  # fmt: skip
-"""Standard deviations of the readings and chi-square limits of the sensors, in the order of `noise`."""
+NOISE = {
+    "jitter_px": 0.3, "grid_px": 1.0, "accel_x_mps2": 0.0158, "accel_y_mps2": 0.0158, "gyro_radps": 0.0026,
+    "accel_share": 0.002, "camera_stamp_s": 5e-5, "imu_stamp_s": 5e-5, "camera_gate": 20.0,
+    "accel_gate": 30.0, "gyro_gate": 25.0,
+}  # fmt: skip
+"""Usual standard deviations of the readings and chi-square limits of the sensors, in the order of `noise`."""
 
 REPORT = (
     "nis_camera", "nis_accel", "nis_gyro", "e_u", "e_v", "e_ax", "e_ay", "e_gz", "gated_camera",

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,10 @@ from calib.core.rig import Rig
 from calib.io.logs import Log, iter_log, refuse_counts
 from calib.solve.clock import time_axis
 from calib.stages.actuator.section import Standing
-from calib.stages.align.section import SENSORS_OF, Align
+from calib.stages.align.section import SENSORS_OF
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
+from calib.stages.estimator.event import NOISE
 from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import QUANTITIES, SENSOR, sensor_values, view_coefficients
@@ -35,12 +37,6 @@ from calib.stages.estimator.sensors import QUANTITIES, SENSOR, sensor_values, vi
 READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
 """Columns of `kinematic.Rows.readings`."""
 _TRUTH = ("true_q1_m", "true_q2_m", "true_phi_rad")
-
-_NOISE = {
-    "jitter_px": 0.3, "grid_px": 1.0, "accel_x_mps2": 0.0158, "accel_y_mps2": 0.0158, "gyro_radps": 0.0026,
-    "accel_share": 0.002, "camera_stamp_s": 5e-5, "imu_stamp_s": 5e-5, "camera_gate": 20.0,
-    "accel_gate": 30.0, "gyro_gate": 25.0,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -167,14 +163,11 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
             "wide priors (calib align finds them)"
         )
         return values, None, said
-    found = _named_values(align)
-    sigmas = {name: values[name][1] for name in SENSOR}
-    for key, names in SENSORS_OF.items():
-        deviations = align.sigma.get(key)
-        for k, name in enumerate(names):
-            one = deviations[k] if isinstance(deviations, list) and k < len(deviations) else deviations
-            if isinstance(one, float):
-                sigmas[name] = max(one, 1e-9)
+    found, deviations = _by_quantity(dict(align)), _by_quantity(align.sigma)
+    sigmas = {
+        name: max(one, 1e-9) if isinstance(one := deviations.get(name), float) else values[name][1]
+        for name in SENSOR
+    }
     values = {name: (found[name], sigmas[name]) for name in SENSOR}
     covariance = (
         None if align.covariance is None else _covariance(align.covariance, sigmas, _between_logs(rig))
@@ -199,11 +192,12 @@ def _between_logs(rig: Rig) -> dict[str, float]:
     return out
 
 
-def _named_values(align: Align) -> dict[str, float]:
-    out: dict[str, float] = {}
+def _by_quantity(by_key: Mapping[str, Any]) -> dict[str, Any]:
+    """What is listed by the keys of `Align` by the quantities of `SENSOR`."""
+    out: dict[str, Any] = {}
     for key, names in SENSORS_OF.items():
-        value = getattr(align, key)
-        out |= dict(zip(names, value if isinstance(value, list) else [value], strict=True))
+        value = by_key.get(key)
+        out |= zip(names, value if isinstance(value, list) else [value] * len(names), strict=False)
     return out
 
 
@@ -281,7 +275,7 @@ def _at_rest(rig: Rig, found: Periods) -> dict[str, float]:
 
 
 def _noise(rig: Rig, found: Periods) -> FloatArray:
-    numbers = dict(_NOISE) | _at_rest(rig, found)
+    numbers = NOISE | _at_rest(rig, found)
     numbers["grid_px"] = found.grid_px
     if rig.align is not None:
         numbers["jitter_px"] = rig.align.jitter_px or numbers["jitter_px"]
@@ -306,7 +300,7 @@ def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None
     tuned, rest = rig.estimator, _at_rest(rig, found)
     if not rest or (tuned is not None and (tuned.accel_noise_mps2 or tuned.gyro_noise_radps)):
         return None
-    moving = dict(zip(_NOISE, _noise(rig, found).tolist(), strict=True))
+    moving = dict(zip(NOISE, _noise(rig, found).tolist(), strict=True))
     x, y, z = (
         rest[key] if key in rest and moving[key] <= _SHAKEN * rest[key] else moving[key]
         for key in ("accel_x_mps2", "accel_y_mps2", "gyro_radps")

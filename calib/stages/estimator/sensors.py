@@ -494,3 +494,19 @@ def invert_marker(
         if limit == 1.0 and abs(step_phi) < 1e-10 and abs(step_l) < 1e-12:
             return phi, length, True
     return phi, length, False
+
+
+def heads_seen(view: FloatArray, sensor: FloatArray, pixels: FloatArray, rest_m: float) -> FloatArray:
+    """Angle and length (n, 2) at which resting markers are seen at pixels (n, 2), NaN where at none.
+
+    Newton's method starts from the head before, else from the straight one of the length `rest_m`.
+    """
+    out = np.full((len(pixels), 2), np.nan)
+    straight = before = (0.0, rest_m)
+    for n, (u, v) in enumerate(pixels.tolist()):
+        for phi, length in (before, straight):
+            phi, length, found = invert_marker(view, sensor, u, v, phi, length)
+            if found:
+                out[n] = before = phi, length
+                break
+    return out
