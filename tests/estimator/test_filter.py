@@ -106,7 +106,7 @@ def test_blocks_make_no_difference() -> None:
     parts = Filter(setup)
     cuts = [0, 1, 17, 300, 301, len(rows)]
     pieces = [part(rows, slice(a, b)) for a, b in pairwise(cuts)]
-    np.testing.assert_array_equal(np.concatenate(list(parts.stream(pieces))), whole)
+    np.testing.assert_array_equal(np.concatenate([parts.run(piece) for piece in pieces]), whole)
 
 
 def test_output_rests_on_the_past_alone() -> None:

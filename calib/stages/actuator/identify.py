@@ -19,7 +19,7 @@ from calib.solve.groups import tied_groups
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
-from calib.stages.actuator.section import CREEP, KNOTS, label_of
+from calib.stages.actuator.section import CREEP, KNOTS, STRENGTHS, label_of
 from calib.stages.actuator.simulate import simulate_batch, state_row
 
 # ----------------------------------------------------------------------
@@ -122,8 +122,7 @@ def values_of(nominal: Machine) -> dict[str, float]:
         "damping_scale_pumps_connected": plant.damping_scale,
         **dict(zip(CREEP, plant.creep_rates, strict=True)),
         **{name: getattr(pump, name) for name in _OF_PUMP},
-        "strength1": nominal.strength[0],
-        "strength2": nominal.strength[1],
+        **dict(zip(STRENGTHS, nominal.strength, strict=True)),
         **vars(limit),
         **vars(orifice),
         **dict(zip(KNOTS, np.polyval(pump.static.elongation_mm, KNOTS_V).tolist(), strict=True)),

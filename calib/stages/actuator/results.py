@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -41,7 +41,7 @@ from calib.stages.actuator.identify import (
 from calib.stages.actuator.identify_pump import LAG
 from calib.stages.actuator.machine import Machine, machine_from
 from calib.stages.actuator.parameters import Stiffness
-from calib.stages.actuator.section import CREEP, KNOTS, LAW, Actuator, Known, PumpSection, in_force
+from calib.stages.actuator.section import CREEP, KNOTS, LAW, STRENGTHS, Actuator, Known, PumpSection, in_force
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def beginning(rig: Rig) -> tuple[Machine, dict[str, float]]:
     sigma: dict[str, float] = {}
     for key, (_, one) in (in_force(None, known.actuator) | stated).items():
         if key == "strength":
-            sigma |= dict(zip(("strength1", "strength2"), one or (0.0, 0.0), strict=True))
+            sigma |= dict(zip(STRENGTHS, one or (0.0, 0.0), strict=True))
         elif key == "elongation_mm":
             given = {} if known.pump is None else known.pump.sigma
             sigma |= {name: one if isinstance(one := given.get(name), float) else 0.0 for name in KNOTS}
@@ -172,8 +172,13 @@ def _delay(found: Identified) -> tuple[float, float] | None:
     return float(found.solution.x[at]) - problem.delay_s, float(math.sqrt(max(V[at, at], 0.0)))
 
 
-def _sigma_of(known: Uncertainty, names: list[str]) -> dict[str, Any]:
-    return {name: finite_or_none(known.sigma[name]) for name in names if name in known.sigma}
+def _told(found: Identified, keys: Collection[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Values of these keys that an identification has estimated or holds, and deviations of the former."""
+    held, values, sigma = found.solution.problem.held, found.solution.values, found.uncertainty.sigma
+    return (
+        {name: value for name, value in {**held, **values}.items() if name in keys},
+        {name: finite_or_none(sigma[name]) for name in values if name in keys},
+    )
 
 
 def sections_from(found: Identified, rig: Rig) -> tuple[Actuator, PumpSection | None]:
@@ -181,7 +186,6 @@ def sections_from(found: Identified, rig: Rig) -> tuple[Actuator, PumpSection | 
 
     Of what the file says, the springs stay, and the damping that no log here can tell.
     """
-    values, uncertainty = found.solution.values, found.uncertainty
     judgement = judged(found.verdict)
     problem = found.solution.problem
     names = list(problem.names)
@@ -193,12 +197,11 @@ def sections_from(found: Identified, rig: Rig) -> tuple[Actuator, PumpSection | 
     if {"lambda1_per_s", "lambda2_N_per_m"} & {*names, *problem.held}:
         # The creep makes sense only whole.
         section |= dict(zip(CREEP, problem.nominal.plant.creep_rates, strict=True))
-    section |= {name: value for name, value in problem.held.items() if name in Actuator.model_fields}
-    mine = [name for name in names if name in Actuator.model_fields]
-    section |= {name: values[name] for name in mine}
-    sigma |= _sigma_of(uncertainty, mine)
-    table = CovarianceTable(order=names, values=uncertainty.covariance.tolist())
-    actuator = Actuator(**section, sigma=sigma, covariance=table, **judgement).with_evidence(found)
+    values, deviations = _told(found, Actuator.model_fields)
+    table = CovarianceTable(order=names, values=found.uncertainty.covariance.tolist())
+    actuator = Actuator(
+        **section | values, sigma=sigma | deviations, covariance=table, **judgement
+    ).with_evidence(found)
     return actuator, _pump(found, rig, judgement).with_evidence(found) if True in kinds else None
 
 
@@ -216,24 +219,18 @@ def _pump(found: Identified, rig: Rig, judgement: dict[str, Any]) -> PumpSection
     values, uncertainty = found.solution.values, found.uncertainty
     problem = found.solution.problem
     nominal = problem.nominal
-    mine = [name for name in problem.names if name in PumpSection.model_fields]
-    section, sigma = _by_tables(rig)
-    section |= {name: value for name, value in problem.held.items() if name in PumpSection.model_fields}
-    section |= {name: values[name] for name in mine}
-    sigma |= _sigma_of(uncertainty, mine)
+    (section, sigma), (told, deviations) = _by_tables(rig), _told(found, PumpSection.model_fields)
+    section |= told
+    sigma |= deviations
     if "laminar_s" in values:
         section["deflation"] = "orifice"
-    strengths = [n for n in ("strength1", "strength2") if n in values]
-    if strengths:
-        pair = [values.get("strength1", nominal.strength[0]), values.get("strength2", nominal.strength[1])]
-        section["strength"] = pair
-        sigma["strength"] = [
-            finite_or_none(uncertainty.sigma.get(n, 0.0)) for n in ("strength1", "strength2")
-        ]
+    if any(n in values for n in STRENGTHS):
+        section["strength"] = [values.get(n, one) for n, one in zip(STRENGTHS, nominal.strength, strict=True)]
+        sigma["strength"] = [finite_or_none(uncertainty.sigma.get(n, 0.0)) for n in STRENGTHS]
     if any(n in values for n in KNOTS):
         whole = {**values_of(nominal), **values}
         section["elongation_mm"] = list(elongation_polynomial([whole[n] for n in KNOTS]))
-        sigma |= _sigma_of(uncertainty, [n for n in KNOTS if n in values])
+        sigma |= _told(found, KNOTS)[1]
     delay = _delay(found)
     remarks = []
     if delay is not None:

@@ -32,6 +32,8 @@ LAW = ("k0_N_per_m", "k1_N_per_m2", "k2_N_per_m3", "k3_N_per_m4")
 CREEP = ("lambda1_per_s", "lambda2_N_per_m", "lambda3")
 KNOTS = ("elongation_6V_mm", "elongation_8V_mm", "elongation_10V_mm", "elongation_12V_mm")
 """Elongations that `elongation_mm` is fitted to; keys of its `sigma`."""
+STRENGTHS = ("strength1", "strength2")
+"""Parameters of an identification that `strength` holds."""
 
 
 class ActuatorParameters(Section):

@@ -19,7 +19,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
-from calib.stages.estimator.sensors import SIZE, accelerometer, gyroscope, marker
+from calib.stages.estimator.sensors import SIZE, accelerometer, gyroscope, marker_rows
 
 _DEGREE = 5
 _ORDER = _DEGREE + 1
@@ -132,34 +132,24 @@ def states_of(span: IntArray, basis: FloatArray, c: FloatArray, sensor: FloatArr
 
 
 @kernel()
-def _seen(view: FloatArray, states: FloatArray, out: FloatArray, by: FloatArray) -> None:
-    for n in range(len(states)):
-        out[n, 0], out[n, 1] = marker(view, states[n], by[n, 0], by[n, 1])
-
-
-@kernel()
-def _felt(states: FloatArray, out: FloatArray, by: FloatArray) -> None:
+def _felt(states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    out, by = np.empty((len(states), 3)), np.empty((len(states), 3, states.shape[1]))
     for n in range(len(states)):
         out[n, 0], out[n, 1] = accelerometer(states[n], by[n, 0], by[n, 1])
         out[n, 2] = gyroscope(states[n], by[n, 2])
+    return out, by
 
 
 def camera_rows(view: FloatArray, knots: Knots, c: FloatArray, sensor: FloatArray, t_s: FloatArray) -> Rows:
     """Pixels of pictures with the stamps (n,), exposed `time_offset_s` earlier."""
     span, basis = basis_rows(knots, t_s - sensor[7])
-    states = states_of(span, basis, c, sensor)
-    out, by = np.empty((len(t_s), 2)), np.empty((len(t_s), 2, SIZE))
-    _seen(view, states, out, by)
-    return Rows(span, basis, out, by)
+    return Rows(span, basis, *marker_rows(view, states_of(span, basis, c, sensor)))
 
 
 def imu_rows(knots: Knots, c: FloatArray, sensor: FloatArray, t_s: FloatArray) -> Rows:
     """Readings a_x, a_y, g_z at the times (n,)."""
     span, basis = basis_rows(knots, t_s)
-    states = states_of(span, basis, c, sensor)
-    out, by = np.empty((len(t_s), 3)), np.empty((len(t_s), 3, SIZE))
-    _felt(states, out, by)
-    return Rows(span, basis, out, by)
+    return Rows(span, basis, *_felt(states_of(span, basis, c, sensor)))
 
 
 @kernel()

@@ -921,7 +921,8 @@ def begin_again(
     """Start a state (36,) from its prior and a picture z; what has been learnt may be wrong and goes.
 
     A log begins at rest. In its middle, `again`, the forces may be anything: those of the pumps, most likely
-    the static ones of the last command, g (4,), or where nothing was `driven` yet those of a hand.
+    the static ones of the last command, g (4,), or where nothing was `driven` yet those of a hand. The hoses
+    of what is `driven` are on.
     """
     x0, P0 = model.x0, model.P0
     phi, length, found = invert_marker(model.camera, x0[INVOLVED:], z[0], z[1], 0.0, x0[1])
@@ -937,6 +938,8 @@ def begin_again(
             across, along = _HELD_N[0] * _HELD_N[0], _HELD_N[1] * _HELD_N[1]
             P[10, 10], P[11, 11] = along + across, along + across
             P[10, 11], P[11, 10] = along - across, along - across
+    if driven:
+        x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
     return True
 
 
@@ -1112,8 +1115,6 @@ def _do_again(
                 flags |= 1
             whole[_STARTED], whole[_PENDING] = 1, 0
             real[_BEGUN] = events.t[now]
-            if driven:
-                x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
         if events.kind[now] == IMU and events.t[now] < real[_BEGUN] + SETTLING_S:
             z[0], z[1], gated[1] = math.nan, math.nan, 1.0
         if (whole[_STARTED] == 0 and events.kind[now] != HOSES) or events.kind[now] == 0:
@@ -1376,8 +1377,6 @@ def _forward(
             marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 1, 0
             chained[k] = False
             marks[_SMOOTHER_BEGUN] = t[k]
-            if driven:
-                x[13], P[13, 13] = 0.0, model.hoses_sigma * model.hoses_sigma
         if kind == IMU and t[k] < marks[_SMOOTHER_BEGUN] + SETTLING_S:
             z[0], z[1] = math.nan, math.nan
         if marks[_SMOOTHER_STARTED] == 1.0 and kind != 0:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -1092,11 +1091,6 @@ class Filter:
             self._room, out,
         )  # fmt: skip
         return out
-
-    def stream(self, blocks: Iterable[Rows]) -> Iterator[FloatArray]:
-        """Estimates of each block in turn."""
-        for rows in blocks:
-            yield self.run(rows)
 
     @property
     def sensor(self) -> FloatArray:
