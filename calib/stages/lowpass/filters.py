@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from calib.core.arrays import BoolArray, ComplexArray, FloatArray
+from calib.core.arrays import ComplexArray, FloatArray
 from calib.core.errors import BadInputError
 
 # ----------------------------------------------------------------------
@@ -33,12 +33,10 @@ class Piece:
     ----------
     t_s : (n,) times of the ticks [s], `1 / rate` apart.
     values : (n, d) one sample each.
-    held : (n,) ticks that repeat the sample before.
     """
 
     t_s: FloatArray
     values: FloatArray
-    held: BoolArray
 
 
 @dataclass(frozen=True)
@@ -49,17 +47,14 @@ class Ticks:
     ----------
     rate_hz : ticks per second.
     pieces : in order of time, each with at least one tick.
+    held : ticks that repeat the sample before.
     dropped : samples that shared a tick with a later one.
     """
 
     rate_hz: float
     pieces: tuple[Piece, ...]
+    held: int
     dropped: int
-
-    @property
-    def held(self) -> int:
-        """Ticks that repeat the sample before."""
-        return sum(int(piece.held.sum()) for piece in self.pieces)
 
     @property
     def longest(self) -> Piece:
@@ -75,19 +70,17 @@ def on_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
     if len(t_s) == 0:
         raise BadInputError("has no samples")
     breaks = np.nonzero(np.diff(t_s) > max(LONGEST_HOLD_S, 2.0 / rate_hz))[0] + 1
-    pieces, dropped = [], 0
+    pieces, held, dropped = [], 0, 0
     for first, last in zip([0, *breaks.tolist()], [*breaks.tolist(), len(t_s)], strict=True):
         k = np.floor(_phase(t_s[first:last], rate_hz) + 0.5).astype(np.int64)
         k -= k[0]
         newest = np.nonzero(np.append(np.diff(k) > 0, True))[0]
         ticks = np.arange(k[-1] + 1)
         source = np.searchsorted(k[newest], ticks, side="right") - 1
-        taken = newest[source]
-        pieces.append(
-            Piece(t_s[first] + ticks / rate_hz, values[first:last][taken], np.asarray(k[taken] != ticks))
-        )
+        pieces.append(Piece(t_s[first] + ticks / rate_hz, values[first:last][newest[source]]))
+        held += len(ticks) - len(newest)
         dropped += len(k) - len(newest)
-    return Ticks(rate_hz, tuple(pieces), dropped)
+    return Ticks(rate_hz, tuple(pieces), held, dropped)
 
 
 def _phase(t_s: FloatArray, rate_hz: float) -> FloatArray:
@@ -545,16 +538,10 @@ def _without_outliers(x: FloatArray) -> tuple[FloatArray, int]:
 
 
 def _density(x: FloatArray, rate_hz: float, segment: int, average: Literal["mean", "median"]) -> FloatArray:
-    from scipy.signal import welch
+    from scipy.signal import detrend, welch
 
-    _, P = welch(x - x.mean(), rate_hz, nperseg=segment, detrend=_without_line, average=average)
+    _, P = welch(x - x.mean(), rate_hz, nperseg=segment, detrend=detrend, average=average)
     return np.asarray(P[1:-1], dtype=np.float64)
-
-
-def _without_line(segments: FloatArray) -> FloatArray:
-    from scipy.signal import detrend
-
-    return np.asarray(detrend(segments, axis=-1, type="linear"), dtype=np.float64)
 
 
 def _smoothed(P: FloatArray) -> FloatArray:
@@ -602,21 +589,21 @@ def grid_step(pixels: FloatArray) -> float:
 
 
 def quantisation_hz(pixels: FloatArray, step_px: float, rate_hz: float) -> FloatArray:
-    """Frequencies (3,) of the sawtooth that rounding adds to motion: quartiles of |speed| / step.
+    """Frequencies (3,) of the sawtooth that rounding adds to motion, quartiles of |speed| / step; else none.
 
     A marker that moves at w px/s crosses w / step grid lines a second. The speed (n,) is that of a cubic
     through half a second; what is slower than a line in two seconds is rest and not
-    counted; NaN where all is. Frequencies above half the rate are folded back.
+    counted. Frequencies above half the rate are folded back.
     """
     from scipy.signal import savgol_filter
 
     window = max(5, int(0.5 * rate_hz) | 1)
     if step_px <= 0.0 or len(pixels) < window:
-        return np.full(3, np.nan)
+        return np.zeros(0)
     speed = np.abs(savgol_filter(pixels, window, 3, deriv=1, delta=1.0 / rate_hz))
     lines = speed[speed > 0.5 * step_px] / step_px
     if len(lines) == 0:
-        return np.full(3, np.nan)
+        return np.zeros(0)
     f = np.percentile(lines, [25.0, 50.0, 75.0])
     return np.asarray(np.abs((f + 0.5 * rate_hz) % rate_hz - 0.5 * rate_hz))
 

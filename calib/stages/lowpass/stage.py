@@ -249,7 +249,6 @@ def solve(inputs: Inputs) -> LowPass:
 
 
 def _log_section(made: Filter, positions: Positions) -> LowPassLog:
-    import numpy as np
 
     from calib.stages.lowpass import filters
     from calib.stages.lowpass.section import LowPassAxis, LowPassLog
@@ -260,10 +259,8 @@ def _log_section(made: Filter, positions: Positions) -> LowPassLog:
     for i, (name, of) in enumerate(zip(positions.names, positions.spectra, strict=True)):
         # The grid is the picture's: u for x and v for y, which a camera that looks along the normal shows so.
         pixels = positions.pixels.longest.values[:, i]
-        f = np.full(3, np.nan)
-        if of.motion_hz > 0.0:
-            f = filters.quantisation_hz(pixels, filters.grid_step(pixels), ticks.rate_hz)
-        f = f[np.isfinite(f)]
+        step_px = filters.grid_step(pixels) if of.motion_hz > 0.0 else 0.0
+        f = filters.quantisation_hz(pixels, step_px, ticks.rate_hz)
         axes[name] = LowPassAxis(
             jitter_before=scale * of.jitter,
             jitter_after=scale * filters.jitter_after(of, made.sections),
