@@ -87,13 +87,7 @@ def allan_variance(parts: Sequence[FloatArray], m: IntArray) -> FloatArray:
     Returns
     -------
     NaN where no part is as long as 2 m.
-
-    Raises
-    ------
-    BadInputError for factors below one.
     """
-    if len(m) and int(m.min()) < 1:
-        raise BadInputError(f"averaging factor: found {int(m.min())}, expected 1 or more")
     total, count = np.zeros(len(m)), np.zeros(len(m))
     for part in parts:
         if len(part) < 2:
@@ -362,18 +356,13 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
 
     Parameters
     ----------
-    parts : readings (n_i,) of uninterrupted parts.
+    parts : readings (n_i,) of uninterrupted parts, the longest of at least `LEAST_SAMPLES`.
     period_s : tau0.
 
-    Raises
-    ------
-    BadInputError for a longest part of less than `LEAST_SAMPLES`, and for readings that never change.
+    Raises `BadInputError` for readings that never change.
     """
     lengths = [len(part) for part in parts]
-    longest = max(lengths, default=0)
-    if longest < LEAST_SAMPLES:
-        raise BadInputError(f"readings: found {longest} in a row, expected at least {LEAST_SAMPLES}")
-    m_fit, m_all = octaves(longest), spaced(longest)
+    m_fit, m_all = octaves(max(lengths)), spaced(max(lengths))
     variance = allan_variance(parts, m_fit)
     if not bool(np.all(variance > 0.0)):
         raise BadInputError("readings: never change, expected noise")

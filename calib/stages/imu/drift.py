@@ -359,9 +359,8 @@ def analyse_drift(
 
     Raises
     ------
-    BadInputError for a log without gz, ax and ay or with too few samples.
+    BadInputError for a log with too few samples.
     """
-    log.places("gz", "ax", "ay")
     sampling, every = regular_parts(log)
     period_s = sampling.period_s
     parts = tuple(part for part in every if len(part.values) * period_s >= _SHORTEST_S)

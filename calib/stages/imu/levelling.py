@@ -159,15 +159,10 @@ def _covariance(parameters: Levelling) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def gains(parameters: Levelling, dt_s: float, steps: int) -> FloatArray:
-    """Gains (steps, 3) of V, angle [1/s] and integral [1/s^2] at steps of dt, from the first step on.
+    """Gains (steps, 3) of V, angle [1/s] and integral [1/s^2] from the first step on.
 
-    Raises `BadInputError` for a step that is not positive or longer than half the time constant.
+    They hold for steps of at most half the time constant.
     """
-    if not 0.0 < dt_s <= 0.5 * parameters.tau_s:
-        raise BadInputError(
-            f"step: found {dt_s:g} s, expected more than zero and at most half of the levelling filter's "
-            f"time constant {parameters.tau_s:g} s"
-        )
     out = np.empty((steps, 4))
     _table(parameters.densities, _covariance(parameters), dt_s, out)
     out.setflags(write=False)

@@ -259,9 +259,9 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
     """
     read = drift_log(log)
     said = [f"{log.source}: {one.text}" for one in read.findings if one.severity == "remark"]
-    if how.tilted and (lacking := read.lacks()):
+    if how.tilted and read.lacks:
         raise BadInputError(
-            f"{log.source}: has no readings of {', '.join(lacking)}, expected all six axes for --rate up"
+            f"{log.source}: has no readings of {', '.join(read.lacks)}, expected all six axes for --rate up"
         )
     sampling, parts = regular_parts(read)
     period = sampling.period_s

@@ -256,7 +256,7 @@ def tracks_of(
     add("accelerometer alone", lambda part: np.unwrap(phi_acc[id(part)]))
     add("MM 3/3", filtered(Mahony()))
     add("levelling", filtered(Levelling()))
-    lacking = ", ".join(log.lacks())
+    lacking = ", ".join(log.lacks)
     if tuned is None:
         skipped.append("tuned: the rig's file has no section orientation_filter")
     elif tuned.up_vector and lacking:
