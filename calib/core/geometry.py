@@ -32,15 +32,11 @@ class Homography:
     Attributes
     ----------
     H : (3, 3), metres to pixels, depth 1 at the centroid of the points.
-    covariance : (9, 9) of H row by row, of rank 8.
     rms_px : root of the mean squared distance between measured and mapped points.
-    sigma_px : standard deviation of one pixel coordinate, from the residuals.
     """
 
     H: FloatArray
-    covariance: FloatArray
     rms_px: float
-    sigma_px: float
 
 
 def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> FloatArray:
@@ -170,23 +166,18 @@ def _residuals(h: FloatArray, X: FloatArray, pixels: FloatArray) -> tuple[FloatA
     return (image - pixels).T.ravel(), J
 
 
-def fit_homography(points: FloatArray, pixels: FloatArray, groups: IntArray | None = None) -> Homography:
+def fit_homography(points: FloatArray, pixels: FloatArray) -> Homography:
     """Homography from points of a plane to pixels that minimises the distances in pixels.
 
     Parameters
     ----------
     points : (M, 2) metres, M >= 4, not all but one on a line.
     pixels : (M, 2).
-    groups : (M,) which residuals belong to the same point; each its own by default.
 
     Raises
     ------
     BadInputError
         When there are fewer than four points or they do not fix a homography.
-
-    Notes
-    -----
-    With four points the covariance and `sigma_px` are NaN: nothing is left to estimate them from.
     """
     if len(points) < 4:
         raise BadInputError(f"a plane needs at least 4 points, got {len(points)}")
@@ -220,36 +211,6 @@ def fit_homography(points: FloatArray, pixels: FloatArray, groups: IntArray | No
         if accepted is None:
             break
         h, now, damping = h_trial, accepted, max(0.1 * damping, 1e-12)
-    return _scaled_to_centroid(h, now, X, from_points, from_pixels, groups)
-
-
-def _scaled_to_centroid(
-    h: FloatArray,
-    now: tuple[FloatArray, FloatArray],
-    X: FloatArray,
-    from_points: FloatArray,
-    from_pixels: FloatArray,
-    groups: IntArray | None,
-) -> Homography:
-    """Undo the normalisation of points and pixels, scale, and propagate the covariance."""
-    r, J = now
-    residuals = r.reshape(2, -1).T / from_pixels[0, 0]
-    own = np.arange(len(X)) if groups is None else groups
-    variance = grouped_variance(residuals, own, 8)
-    # The direction h that fills the null space is removed again by the scaling below.
-    normal = J.T @ J
-    inverse = np.linalg.inv(normal + np.trace(normal) * np.outer(h, h))
-    covariance = inverse * variance * from_pixels[0, 0] ** 2
-    # vec(T H S) = (T kron S^T) vec(H) row by row; then the scale, h / (g . h) with g . h the depth.
-    linear = np.kron(np.linalg.inv(from_pixels), from_points.T)
-    h = linear @ h
-    g = np.zeros(9)
-    g[6:] = np.linalg.solve(from_points, np.array([0.0, 0.0, 1.0]))
-    depth = g @ h
-    scaling = (np.eye(9) - np.outer(h, g) / depth) / depth @ linear
-    return Homography(
-        H=(h / depth).reshape(3, 3),
-        covariance=scaling @ covariance @ scaling.T,
-        rms_px=float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))),
-        sigma_px=float(np.sqrt(variance)),
-    )
+    H = np.linalg.inv(from_pixels) @ h.reshape(3, 3) @ from_points
+    depth = H[2] @ np.linalg.solve(from_points, [0.0, 0.0, 1.0])
+    return Homography(H / depth, float(np.sqrt(now[0] @ now[0] / len(points))) / px)

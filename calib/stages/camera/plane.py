@@ -432,8 +432,7 @@ def calibrate_plane(
     """
     world_m = np.concatenate([view.target_m for view in views])
     pixels = np.concatenate([view.pixels for view in views])
-    groups = _same_points(world_m)
-    pose = fit_pose(camera, world_m, pixels, groups)
+    pose = fit_pose(camera, world_m, pixels, _same_points(world_m))
     pictures, comparison = compare_pictures(camera, views, pose)
     pose = replace(pose, covariance=pose.covariance * comparison.inflation)
 
@@ -442,7 +441,7 @@ def calibrate_plane(
         low, high = world_m.min(axis=0), world_m.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     sigma = position_sigma(camera, camera_covariance, pose, box_grid(box, 9, 9).reshape(-1, 2))
-    direct = fit_homography(world_m, pixels, groups)
+    direct = fit_homography(world_m, pixels)
     read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)
     whole = replace(pose, covariance=_pose_covariance(pose, camera_covariance))
     plane = Plane(

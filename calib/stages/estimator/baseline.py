@@ -21,7 +21,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.core.geometry import fit_homography
+from calib.core.geometry import box_grid, fit_homography
 from calib.stages.actuator.kinematics import inverse_coefficients
 from calib.stages.estimator.kinematic import Rows
 from calib.stages.estimator.sensors import SIZE, marker
@@ -69,9 +69,7 @@ def undistorting_nothing(
 
     Raises `BadInputError` where the camera does not see enough of the workspace.
     """
-    x0, y0, x1, y1 = workspace_m
-    x, y = np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 7))
-    world = np.stack([x.ravel(), y.ravel()], axis=1)
+    world = box_grid(workspace_m, 9, 7).reshape(-1, 2)
     pixels = np.empty_like(world)
     state, by = np.zeros(SIZE), np.empty((2, SIZE))
     for i, place in enumerate(world):
@@ -83,7 +81,7 @@ def undistorting_nothing(
     inside &= (pixels <= np.array([width - 0.5, height - 0.5])).all(axis=1)
     if inside.sum() < 12:
         raise BadInputError("plane: the camera does not see the workspace")
-    H = fit_homography(world[inside], pixels[inside], np.arange(int(inside.sum()))).H
+    H = fit_homography(world[inside], pixels[inside]).H
     return np.asarray(np.linalg.inv(H), dtype=np.float64)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import fit_homography
+from calib.core.geometry import box_grid, fit_homography
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficients
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
@@ -138,7 +138,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
         return None
     camera, R, t = rig.camera.optics, np.array(known.R_CW), np.array(known.t_CW_m)
     x0, y0, x1, y1 = rig.workspace_m
-    grid = np.stack(np.meshgrid(np.linspace(x0, x1, 9), np.linspace(y0, y1, 7)), axis=-1).reshape(-1, 2)
+    grid = box_grid((x0, y0, x1, y1), 9, 7).reshape(-1, 2)
     # The denominator is the reciprocal depth when A's depth is in metres.
     A_inverse = np.array(known.A_inverse)
     A = np.asarray(np.linalg.inv(A_inverse), dtype=np.float64)
@@ -152,7 +152,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     inside = ((pixels >= -0.5) & (pixels <= np.array([width - 0.5, height - 0.5]))).all(axis=1)
     raw, raw_least, error = None, 0.0, 0.0
     if inside.sum() >= 12:
-        H = fit_homography(grid[inside], pixels[inside], np.arange(int(inside.sum()))).H
+        H = fit_homography(grid[inside], pixels[inside]).H
         centre = np.array([[0.5 * (x0 + x1), 0.5 * (y0 + y1)]])
         H = H * (float((centre @ R[2, :2] + t[2])[0]) / _depths(H, centre)[0])
         raw = np.asarray(np.linalg.inv(H))
