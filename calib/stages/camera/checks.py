@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.geometry import box_grid
 from calib.stages.camera.bundle import (
     Calibration,
     Minimum,
@@ -944,7 +945,8 @@ def best_split(calibration: Calibration) -> Split | None:
 # the whole picture: the expected squared error, in pixels, of explaining a new view anywhere in the picture
 # with this camera (optimal design, criterion V).
 
-_EDGES = {0: "right", 90: "bottom", 180: "left", 270: "top"}
+_EDGES = {"right": 0.0, "bottom": 90.0, "left": 180.0, "top": 270.0}
+"""Directions of a picture's edges, from right over down, degrees."""
 _PLACES = (0.22, 0.5, 0.78)
 _GRID = 6
 _NEW_SHARE = 0.04
@@ -1012,15 +1014,11 @@ def _words(column: int, row: int) -> str:
     return f"at the {across or down} edge of the picture"
 
 
-def _rotation(tilt: float, azimuth: float) -> FloatArray:
-    """Tilt that takes the side in the direction `azimuth` (0 right, pi/2 down) away from the camera."""
-    return np.asarray(rotation_exp(tilt * np.array([[np.sin(azimuth), -np.cos(azimuth), 0.0]]))[0])
-
-
 def tilted(tilt_deg: float, away: str) -> FloatArray:
     """Rotation (3, 3) of a board whose edge `away` in the picture leans away from the camera."""
-    azimuth = next((angle for angle, edge in _EDGES.items() if edge == away), 0)
-    return _rotation(np.radians(tilt_deg), np.radians(azimuth))
+    azimuth = np.radians(_EDGES.get(away, 0.0))
+    axis = np.array([[np.sin(azimuth), -np.cos(azimuth), 0.0]])
+    return np.asarray(rotation_exp(np.radians(tilt_deg) * axis)[0])
 
 
 def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | None:
@@ -1037,10 +1035,11 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | 
     width, height = camera.image_size_px
     box = target_box(calibration)
     extent = box.max(axis=0) - box.min(axis=0)
-    across, along = np.meshgrid(np.linspace(-0.5, 0.5, _GRID), np.linspace(-0.5, 0.5, _GRID))
-    target = np.stack([across.ravel() * extent[0], along.ravel() * extent[1], np.zeros(_GRID**2)], axis=1)
+    flat = box_grid((-0.5, -0.5, 0.5, 0.5), _GRID, _GRID).reshape(-1, 2)
+    target = np.column_stack([flat, np.zeros(len(flat))]) * extent
     diagonal = float(np.hypot(extent[0], extent[1]))
-    rotations, translations, kinds = [], [], []
+    rotations, translations = [], []
+    kinds: list[tuple[str, float, str, float]] = []
     for row, v in enumerate(_PLACES):
         for column, u in enumerate(_PLACES):
             ray = undistort(camera, np.array([u * (width - 1), v * (height - 1)]))
@@ -1048,11 +1047,11 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | 
                 continue
             for span in (0.35, 0.6):
                 distance = camera.fx_px * diagonal / (span * np.hypot(width, height))
-                for azimuth in (None, 0, 90, 180, 270):
-                    tilt = 0.0 if azimuth is None else 35.0
-                    rotations.append(_rotation(np.radians(tilt), np.radians(azimuth or 0)))
+                for away in ("", *_EDGES):
+                    tilt_deg = 35.0 if away else 0.0
+                    rotations.append(tilted(tilt_deg, away))
                     translations.append(distance * np.array([ray[0], ray[1], 1.0]))
-                    kinds.append((column, row, tilt, "" if azimuth is None else _EDGES[azimuth], span))
+                    kinds.append((_words(column, row), tilt_deg, away, span))
     if not kinds or not np.all(np.isfinite(information)):
         return None
     R, t = np.array(rotations), np.array(translations)
@@ -1070,14 +1069,12 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | 
         return None
     reference = S.mean(axis=0)
     remaining = _remaining(information, reference, S)
-    candidates = []
-    for i in np.argsort(remaining, kind="stable"):
-        if new.any() and not new[i]:
-            continue
-        column, row, tilt, away, span = kinds[kept[i]]
-        where = _words(column, row)
-        candidates.append(Candidate(where, tilt, away, span, float(remaining[i]), R[kept[i]], t[kept[i]]))
-    return Plan(tuple(candidates), calibration, target, information, reference)
+    candidates = tuple(
+        Candidate(*kinds[int(kept[i])], float(remaining[i]), R[kept[i]], t[kept[i]])
+        for i in np.argsort(remaining, kind="stable")
+        if new[i] or not new.any()
+    )
+    return Plan(candidates, calibration, target, information, reference)
 
 
 def _repeats(calibration: Calibration, target: FloatArray, pixels: FloatArray) -> BoolArray:
