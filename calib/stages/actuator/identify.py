@@ -1665,8 +1665,7 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
     problem = solution.problem
     values = {**values_of(problem.nominal), **problem.held, **solution.values}
     vague = [n for n, why in solution.fixed.items() if n != "lambda3" and NO_CREEP not in why]
-    order = list(PARAMETERS)
-    names = tuple(sorted([*problem.names, *vague], key=order.index))
+    names = _ordered({*problem.names, *vague})
     now = np.zeros((len(names), len(names)))
     at = [names.index(name) for name in problem.names]
     size = np.array([max(abs(values[n]), 0.1 * PARAMETERS[n].scale) for n in problem.names])

@@ -251,28 +251,19 @@ def drive_for(log: OpenLog, rig: Rig, model: str) -> Drive | None:
     return None
 
 
-class Estimate:
-    """The filter at work on the blocks of a log."""
+Estimator = Filter | DrivenFilter | Handover
 
-    def __init__(self, setup: Setup, drive: Drive | None, model: str) -> None:
-        self._kinematic = Filter(setup) if drive is None else None
-        self._driven = (
-            None if drive is None else (DrivenFilter if model == "driven" else Handover)(setup, drive)
-        )
 
-    def __call__(self, rows: Rows, log: Log) -> FloatArray:
-        """Rows of `OUT` for the rows of this block."""
-        if self._kinematic is not None:
-            return self._kinematic.run(rows)
-        assert self._driven is not None
-        return self._driven.run(rows, pwm_of(log))
+def estimator_for(setup: Setup, drive: Drive | None, model: str) -> Estimator:
+    """The kinematic filter without a drive, else the driven one or, with "auto", both."""
+    if drive is None:
+        return Filter(setup)
+    return DrivenFilter(setup, drive) if model == "driven" else Handover(setup, drive)
 
-    @property
-    def sensor(self) -> FloatArray | None:
-        """As `Filter.sensor`; None with the driven model alone, whose plant has a say in it."""
-        if self._kinematic is not None:
-            return self._kinematic.sensor
-        return self._driven.sensor if isinstance(self._driven, Handover) else None
+
+def estimate(estimator: Estimator, rows: Rows, log: Log) -> FloatArray:
+    """Rows of `OUT` for the rows of this block."""
+    return estimator.run(rows) if isinstance(estimator, Filter) else estimator.run(rows, pwm_of(log))
 
 
 # ----------------------------------------------------------------------
@@ -706,9 +697,10 @@ def replay_log(
             write(whole.out[:, _COLUMNS])
         else:
             baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if log.both else None
-            estimate = Estimate(log.setup, drive, model)
-            _stream(log, estimate, baseline, fused, sums, write, progress)
-            sensor = estimate.sensor
+            running = estimator_for(log.setup, drive, model)
+            _stream(log, running, baseline, fused, sums, write, progress)
+            # With the driven model alone its plant has a say in it.
+            sensor = None if isinstance(running, DrivenFilter) else running.sensor
             if fused and sums.baseline.scored:
                 compared["baseline"] = _lengths_and_angle(sums.baseline)
             elif not fused and sums.fused.scored:
@@ -733,7 +725,7 @@ def _states_to(
 
 def _stream(
     log: OpenLog,
-    estimate: Callable[[Rows, Log], FloatArray],
+    running: Estimator,
     baseline: Baseline | None,
     fused: bool,
     sums: Sums,
@@ -758,7 +750,7 @@ def _stream(
     with behind(finish) as hand:
         for block in ahead(log.stream):
             rows = rows_of(block, log.periods.ticks)
-            hand((block, rows, estimate(rows, block)))
+            hand((block, rows, estimate(running, rows, block)))
             done += len(block)
             if progress is not None:
                 progress(min(done * 80, size), size)
