@@ -35,11 +35,6 @@ def chi_square_band(degrees: int, draws: int, level: float = 0.95) -> tuple[floa
     return float(chdtri(total, 1.0 - tail)) / max(draws, 1), float(chdtri(total, tail)) / max(draws, 1)
 
 
-def correlation_band(count: int) -> float:
-    """95 % bound of the correlation of a white sequence with itself one step later."""
-    return 1.96 / math.sqrt(max(count, 1))
-
-
 def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m: float) -> FloatArray:
     """NEES (n,) of (q1, q2, phi), two degrees of freedom, of rows of `kinematic.OUT` against the truth.
 
@@ -66,7 +61,6 @@ class Tally:
     start_s: float = math.nan
     end_s: float = math.nan
     scored: int = 0
-    log_likelihood: float = 0.0
     sensors: dict[str, FloatArray] = field(
         default_factory=lambda: {name: np.zeros(8) for name in (*SENSORS, "last")}
     )
@@ -84,7 +78,6 @@ class Tally:
         flags = out[:, OUT.index("flags")].astype(np.int64)
         for bit in (1, 2, 4, 8, 16, 32, 64):
             self.flags[bit] = self.flags.get(bit, 0) + int(np.count_nonzero(flags & bit))
-        self.log_likelihood += float(np.nansum(out[:, OUT.index("log_likelihood")]))
         late = out[:, 0] >= self.start_s + _SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])
@@ -159,5 +152,5 @@ class Tally:
             high=high,
             inside=float(sums[3] / count),
             correlation=finite_or_none(max(correlations, key=abs)),
-            correlation_bound=correlation_band(count),
+            correlation_bound=1.96 / math.sqrt(count),
         )
