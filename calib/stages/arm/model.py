@@ -251,12 +251,12 @@ def _nozzle(ratio: float) -> float:
 
 
 @kernel()
-def _valve(command: FloatArray, start_kpa: float, q: FloatArray, step_s: float) -> FloatArray:
+def _valve(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
     rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak, input_s = q
     out = np.empty(len(command))
     outlet = chamber = start_kpa
     ahead = overlap
-    step_s /= _FINER
+    step_s = STEP_S / _FINER
     flow = step_s * line
     held = 1.0 + ratio * flow
     smooth, follows = command[0], 1.0 - math.exp(-step_s / input_s)
@@ -286,28 +286,26 @@ def _valve(command: FloatArray, start_kpa: float, q: FloatArray, step_s: float) 
 
 
 @kernel()
-def _lag(command: FloatArray, start_kpa: float, q: FloatArray, step_s: float) -> FloatArray:
+def _lag(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
     level, rises_s, falls_s = q
     out = np.empty(len(command))
     pressure = start_kpa
     for k in range(len(command)):
         out[k] = pressure
         ahead = level * command[k] - pressure
-        pressure += ahead * (1.0 - math.exp(-step_s / (rises_s if ahead > 0.0 else falls_s)))
+        pressure += ahead * (1.0 - math.exp(-STEP_S / (rises_s if ahead > 0.0 else falls_s)))
     return out
 
 
 @kernel()
-def _segment(
-    pressure: FloatArray, angle: float, chord: float, q: FloatArray, moment: float, step_s: float
-) -> FloatArray:
+def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, moment: float) -> FloatArray:
     rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
     compliance, c0, c1, c2 = q[12:]
     out = np.empty((len(pressure), 2))
     short = c0 + c1 * angle + c2 * angle * angle - chord
     elastic, crept = 0.0, 0.0
     inside = pressure[0]
-    follows, fills = 1.0 - math.exp(-step_s / lag), 1.0 - math.exp(-step_s / fill)
+    follows, fills = 1.0 - math.exp(-STEP_S / lag), 1.0 - math.exp(-STEP_S / fill)
     for k in range(len(pressure)):
         out[k, 0] = angle
         out[k, 1] = c0 + c1 * angle + c2 * angle * angle - short
@@ -317,8 +315,8 @@ def _segment(
         change = follows * (aim + creep * crept + vented * short - angle)
         angle += change
         elastic = min(max(elastic + change, -reach), reach)
-        crept += step_s / creep_s * (angle - rest - crept)
-        short -= step_s / settling_s * short * math.exp(min(sooner * inside, 5.0))
+        crept += STEP_S / creep_s * (angle - rest - crept)
+        short -= STEP_S / settling_s * short * math.exp(min(sooner * inside, 5.0))
     return out
 
 
@@ -339,7 +337,7 @@ def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
     start = trial.pressure_kpa[0] if len(trial.pressure_kpa) else 0.0
     name = next(one for one, names in DRIVES.items() if names[0] in values)
     q = np.array([values[one] for one in DRIVES[name]])
-    return np.asarray((_valve if name == "valve" else _lag)(trial.command, start, q, STEP_S))
+    return np.asarray((_valve if name == "valve" else _lag)(trial.command, start, q))
 
 
 def segment_run(
@@ -348,7 +346,7 @@ def segment_run(
     """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first pose."""
     q = np.array([values[name] for name in SEGMENT])
     moment = trial.load_kg * GRAVITY_MPS2 * values["chord_m"]
-    out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, moment, STEP_S)
+    out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, moment)
     return out[:, 0], out[:, 1]
 
 

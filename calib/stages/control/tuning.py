@@ -408,7 +408,7 @@ def _reason(model: Model, q: FloatArray, wanted: FloatArray, k: int, missing: Fl
     return f"{name} would have to deflate at {-rate:.3g} N/s, its air leaves at {least:.3g} N/s"
 
 
-def follow(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> Following:
+def follow(model: Model, q_m: FloatArray) -> Following:
     """How far the pumps can follow lengths (n, 2) [m] at the ticks, three at least."""
     wanted = wanted_motion(model, q_m).force_N
     given, h = _nearest(model, wanted), model.tick_s
@@ -416,7 +416,7 @@ def follow(model: Model, q_m: FloatArray, tolerance_m: float = TOLERANCE_M) -> F
     missing = np.zeros_like(short)
     for k in np.flatnonzero(np.any(short != 0.0, axis=1)):
         missing[k] = np.linalg.solve(static_stiffness(model.plant, q_m[k]), short[k])
-    bad = np.flatnonzero(np.max(np.abs(missing), axis=1) > tolerance_m)
+    bad = np.flatnonzero(np.max(np.abs(missing), axis=1) > TOLERANCE_M)
     rates = np.diff(wanted, axis=0) / h
     at = int(bad[0]) if len(bad) else None
     return Following(

@@ -146,17 +146,14 @@ def _form(m1: int, m2: int, lengths: Sequence[int]) -> FloatArray:
     return np.asarray(scale * (R * pairs) @ R.T / (2.0 * all1 * all2 * float(m1) ** 2 * float(m2) ** 2))
 
 
-def covariance_forms(m: IntArray, lengths: Sequence[int], diagonal: bool = False) -> FloatArray:
+def covariance_forms(m: IntArray, lengths: Sequence[int]) -> FloatArray:
     """G (j, j, 3, 3) with cov(avar_i, avar_j) = theta G_ij theta, theta = (N^2, B^2, K^2) in periods.
 
     Parameters
     ----------
     m : averaging factors.
     lengths : numbers of samples of the parts.
-    diagonal : return the variances alone, (j, 3, 3).
     """
-    if diagonal:
-        return np.stack([_form(factor, factor, lengths) for factor in m.tolist()])
     out = np.zeros((len(m), len(m), 3, 3))
     for i, one in enumerate(m.tolist()):
         for j, other in enumerate(m.tolist()):
@@ -168,7 +165,7 @@ def covariance_forms(m: IntArray, lengths: Sequence[int], diagonal: bool = False
 
 def degrees_of_freedom(m: IntArray, lengths: Sequence[int], theta: FloatArray) -> FloatArray:
     """Equivalent degrees of freedom (len(m),) under (N^2, B^2, K^2), at least one."""
-    variance = np.einsum("jpq,p,q->j", covariance_forms(m, lengths, diagonal=True), theta, theta)
+    variance = np.array([theta @ _form(factor, factor, lengths) @ theta for factor in m.tolist()])
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.maximum(2.0 * (design(m.astype(np.float64)) @ theta) ** 2 / variance, 1.0))
 
