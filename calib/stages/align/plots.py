@@ -10,7 +10,7 @@ from calib.core.arrays import FloatArray
 from calib.core.plot import SIGMA, Band, Curve, Figure, Mark, Plot, Rule, every, judged, short
 from calib.core.words import number as with_sigma
 from calib.stages.align.section import Align
-from calib.stages.align.solve import Alignment, Trace
+from calib.stages.align.solve import OFFSETS_S, Alignment, Trace
 from calib.stages.estimator.sensors import SENSOR
 
 _ROWS = (
@@ -85,7 +85,7 @@ def _correlation(fit: Alignment) -> Figure:
         f"{with_sigma(offset, sigma)} \N{PLUS-MINUS SIGN} {with_sigma(sigma, sigma)} ms."
     )
     x, y = "pictures later than the gyroscope (ms)", "correlation"
-    at_ms, value = 1e3 * fit.correlation.offset_s, fit.correlation.value
+    at_ms, value = 1e3 * OFFSETS_S, fit.correlation
     if not np.isfinite(value).any():
         return Figure(title, note, (Plot(x, y, empty="too few pictures"),), 3.4)
     low, high = float(at_ms[0]), float(at_ms[-1])

@@ -32,13 +32,11 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
 
     Raises `BadInputError` for time that runs backwards, and sensors that are stuck or contradict each other.
     """
-    remarks: list[str] = []
     camera = log.signals("u_px", "v_px") if len(log.sampled("u_px", "v_px")) else None
     if not len(log.sampled("gz_radps")):
-        return None, [*remarks, f"{log.source}: has no gyroscope (gz_radps), which an alignment needs"]
+        return None, [f"{log.source}: has no gyroscope (gz_radps), which an alignment needs"]
     if camera is None:
-        lacking = f"{log.source}: has no picture of the marker (u_px, v_px), which an alignment needs"
-        return None, [*remarks, lacking]
+        return None, [f"{log.source}: has no picture of the marker (u_px, v_px), which an alignment needs"]
     imu = log.signals("gz_radps", optional=_ACCEL, partly=True)
     imu.refuse_stuck(*imu.names)
     imu.refuse_mirrored()
@@ -47,6 +45,7 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
         if name in imu.names:
             readings[:, k] = imu[name]
     both = np.isfinite(readings[:, :2]).all(axis=1)
+    remarks = []
     if not both.any():
         remarks.append(f"{log.source}: has no accelerometer; the mount angle stays unknown")
     else:

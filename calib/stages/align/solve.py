@@ -351,7 +351,8 @@ SPLIT_S = 1.0
 SHORTEST_S = 1.0
 """Gaps at which a log is split, and stretches that are too short to be used."""
 
-_OFFSETS_S = np.arange(-0.1, 0.3001, 0.0025)
+OFFSETS_S = np.arange(-0.1, 0.3001, 0.0025)
+"""Time offsets (k,) among which the first guess is."""
 _LEAST_PICTURES = 20
 _START_LEAST_SAMPLES = 40
 _LENGTH_M = 0.07
@@ -410,14 +411,6 @@ class Piece:
     length: FloatArray
     fine: BoolArray
     theta: FloatArray
-
-
-@dataclass(frozen=True)
-class Correlation:
-    """Correlation of the camera's rate of angle with the gyroscope's over the time offset (k,) [s]."""
-
-    offset_s: FloatArray
-    value: FloatArray
 
 
 @dataclass(frozen=True)
@@ -538,10 +531,10 @@ def _factors(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
     return factor, total - factor * cross
 
 
-def correlation(pieces: Sequence[Piece]) -> Correlation:
-    """Correlation of the camera's rate, over four frames, with the gyroscope's over the same time."""
+def correlation(pieces: Sequence[Piece]) -> FloatArray:
+    """Correlation (k,) of the camera's rate, over four frames, with the gyroscope's at `OFFSETS_S`."""
     values = []
-    for offset in _OFFSETS_S:
+    for offset in OFFSETS_S:
         cross, one, two = 0.0, 0.0, 0.0
         for piece in pieces:
             use = np.flatnonzero(_use(piece, float(offset)))
@@ -556,7 +549,7 @@ def correlation(pieces: Sequence[Piece]) -> Correlation:
             a, b = a - a.mean(), b - b.mean()
             cross, one, two = cross + float(a @ b), one + float(a @ a), two + float(b @ b)
         values.append(cross / math.sqrt(one * two) if one * two > 0.0 else math.nan)
-    return Correlation(_OFFSETS_S.copy(), np.array(values))
+    return np.array(values)
 
 
 def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
@@ -747,19 +740,19 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 
     Raises `BadInputError` for a gyroscope in other units or with another sign.
     """
-    sums = np.zeros((len(logs), len(_OFFSETS_S), 3))
+    sums = np.zeros((len(logs), len(OFFSETS_S), 3))
     for piece in pieces:
-        sums[piece.log] += [_moments(piece, offset) for offset in _OFFSETS_S.tolist()]
+        sums[piece.log] += [_moments(piece, offset) for offset in OFFSETS_S.tolist()]
     for log, own in zip(logs, sums, strict=True):
         _check_gyro(log, own)
     factors, squares = _factors(sums.sum(axis=0))
-    usual = int(np.argmin(np.abs(_OFFSETS_S - usual_offset_s)))
+    usual = int(np.argmin(np.abs(OFFSETS_S - usual_offset_s)))
     best = int(np.argmin(squares))
     moves = bool((squares.max() - squares[best]) / _PHI_SIGMA**2 > _WORTH)
     at = best if moves else usual
     most = logs[int(np.argmax(sums[:, at, 2]))]
     _check_gyro(most, sums.sum(axis=0)[at : at + 1])
-    offset = float(_OFFSETS_S[at])
+    offset = float(OFFSETS_S[at])
     made = [_stretch(piece, offset) for piece in pieces]
     stretches = tuple(stretch for stretch in made if stretch is not None)
     mount = _mount(stretches) if stretches else 0.0
@@ -977,6 +970,7 @@ class Alignment:
     sensor, covariance : (13,) and (13, 13) of `SENSOR`; mean, prior : (13,) prior and its deviations.
     noise, converged, steps : of the fit. moves : the first guess could see the offset. factor : of the
         gyroscope against the camera.
+    correlation : (k,) of the camera's rate of angle with the gyroscope's at `OFFSETS_S`.
     left_out : sentences on gaps and logs that were not used.
     """
 
@@ -991,7 +985,7 @@ class Alignment:
     factor: float
     logs: tuple[LogCheck, ...]
     traces: tuple[Trace, ...]
-    correlation: Correlation
+    correlation: FloatArray
     left_out: tuple[str, ...]
 
     @property
@@ -1044,17 +1038,15 @@ def _rms(values: FloatArray) -> float:
 
 
 def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
-    out = []
-    for stretch, c, good in zip(problem.stretches, fit.coefficients, fit.good, strict=True):
-        out.append(
-            Trace(
-                stretch.log, stretch.camera_s, good,
-                pictures_off(problem, stretch, c, first), pictures_off(problem, stretch, c, fit.sensor),
-                stretch.imu_s,
-                readings_off(stretch, c, first), readings_off(stretch, c, fit.sensor),
-            )
-        )  # fmt: skip
-    return tuple(out)
+    return tuple(
+        Trace(
+            stretch.log, stretch.camera_s, good,
+            pictures_off(problem, stretch, c, first), pictures_off(problem, stretch, c, fit.sensor),
+            stretch.imu_s,
+            readings_off(stretch, c, first), readings_off(stretch, c, fit.sensor),
+        )
+        for stretch, c, good in zip(problem.stretches, fit.coefficients, fit.good, strict=True)
+    )  # fmt: skip
 
 
 def _check(
