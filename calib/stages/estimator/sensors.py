@@ -228,11 +228,13 @@ def head_position(phi: float, length: float) -> tuple[float, float]:
 
 
 @kernel(arrays=False)
-def _fisheye_pixel(
+def _by_fisheye(
     view: FloatArray, p1: float, p2: float, p3: float
 ) -> tuple[float, float, float, float, float, float]:
-    """The same by a fisheye lens (`calib.stages.camera.model`) at (p1, p2, p3) of the camera's frame."""
-    fx, fy, skew, cx, cy = view[9], view[10], view[11], view[12], view[13]
+    """What a fisheye lens (`calib.stages.camera.model`) makes of (p1, p2, p3) of the camera's frame.
+
+    Distorted normalised coordinates x, y and their derivatives: x, y, x_X, x_Y, y_X, y_Y.
+    """
     k1, k2, k3, k4 = view[14], view[15], view[18], view[19]
     rho = max(math.hypot(p1, p2), 1e-9 * p3)
     theta, d2 = math.atan2(rho, p3), rho * rho + p3 * p3
@@ -243,15 +245,31 @@ def _fisheye_pixel(
     radial_X, radial_Y = p1 * view[0] + p2 * view[1], p1 * view[3] + p2 * view[4]
     m_X, m_Y = bend * radial_X + along * view[2], bend * radial_Y + along * view[5]
     xd_X, xd_Y = m * view[0] + p1 * m_X, m * view[3] + p1 * m_Y
-    yd_X, yd_Y = m * view[1] + p2 * m_X, m * view[4] + p2 * m_Y
-    return (
-        fx * p1 * m + skew * p2 * m + cx,
-        fy * p2 * m + cy,
-        fx * xd_X + skew * yd_X,
-        fx * xd_Y + skew * yd_Y,
-        fy * yd_X,
-        fy * yd_Y,
-    )
+    return p1 * m, p2 * m, xd_X, xd_Y, m * view[1] + p2 * m_X, m * view[4] + p2 * m_Y
+
+
+@kernel(arrays=False)
+def _by_lens(
+    view: FloatArray, p1: float, p2: float, p3: float
+) -> tuple[float, float, float, float, float, float]:
+    """As `_by_fisheye`, of a lens with radial and tangential distortion."""
+    inverse = 1.0 / p3
+    x, y = p1 * inverse, p2 * inverse
+    x_X, x_Y = (view[0] - x * view[2]) * inverse, (view[3] - x * view[5]) * inverse
+    y_X, y_Y = (view[1] - y * view[2]) * inverse, (view[4] - y * view[5]) * inverse
+    k1, k2, t1, t2, k3, k4, k5, k6 = (
+        view[14], view[15], view[16], view[17], view[18], view[19], view[20], view[21],
+    )  # fmt: skip
+    r2 = x * x + y * y
+    over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over
+    slope = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - radial * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) * over
+    xd = x * radial + 2.0 * t1 * x * y + t2 * (r2 + 2.0 * x * x)
+    yd = y * radial + t1 * (r2 + 2.0 * y * y) + 2.0 * t2 * x * y
+    xx = radial + 2.0 * x * x * slope + 2.0 * t1 * y + 6.0 * t2 * x
+    yy = radial + 2.0 * y * y * slope + 6.0 * t1 * y + 2.0 * t2 * x
+    xy = 2.0 * x * y * slope + 2.0 * t1 * x + 2.0 * t2 * y
+    return xd, yd, xx * x_X + xy * y_X, xx * x_Y + xy * y_Y, xy * x_X + yy * y_X, xy * x_Y + yy * y_Y
 
 
 @kernel(arrays=False)
@@ -266,34 +284,14 @@ def _pixel(view: FloatArray, X: float, Y: float) -> tuple[float, float, float, f
     if not p3 > 0.0:
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
     if view[24] != 0.0:
-        return _fisheye_pixel(view, p1, p2, p3)
-    inverse = 1.0 / p3
-    x, y = p1 * inverse, p2 * inverse
-    x_X, x_Y = (view[0] - x * view[2]) * inverse, (view[3] - x * view[5]) * inverse
-    y_X, y_Y = (view[1] - y * view[2]) * inverse, (view[4] - y * view[5]) * inverse
+        xd, yd, xd_X, xd_Y, yd_X, yd_Y = _by_fisheye(view, p1, p2, p3)
+    else:
+        xd, yd, xd_X, xd_Y, yd_X, yd_Y = _by_lens(view, p1, p2, p3)
     fx, fy, skew, cx, cy = view[9], view[10], view[11], view[12], view[13]
-    k1, k2, t1, t2, k3, k4, k5, k6 = (
-        view[14], view[15], view[16], view[17], view[18], view[19], view[20], view[21],
-    )  # fmt: skip
-    r2 = x * x + y * y
-    over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over
-    slope = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - radial * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) * over
-    xd = x * radial + 2.0 * t1 * x * y + t2 * (r2 + 2.0 * x * x)
-    yd = y * radial + t1 * (r2 + 2.0 * y * y) + 2.0 * t2 * x * y
-    xx = radial + 2.0 * x * x * slope + 2.0 * t1 * y + 6.0 * t2 * x
-    yy = radial + 2.0 * y * y * slope + 6.0 * t1 * y + 2.0 * t2 * x
-    xy = 2.0 * x * y * slope + 2.0 * t1 * x + 2.0 * t2 * y
-    xd_X, xd_Y = xx * x_X + xy * y_X, xx * x_Y + xy * y_Y
-    yd_X, yd_Y = xy * x_X + yy * y_X, xy * x_Y + yy * y_Y
     return (
-        fx * xd + skew * yd + cx,
-        fy * yd + cy,
-        fx * xd_X + skew * yd_X,
-        fx * xd_Y + skew * yd_Y,
-        fy * yd_X,
-        fy * yd_Y,
-    )
+        fx * xd + skew * yd + cx, fy * yd + cy,
+        fx * xd_X + skew * yd_X, fx * xd_Y + skew * yd_Y, fy * yd_X, fy * yd_Y,
+    )  # fmt: skip
 
 
 @kernel(arrays=False)
