@@ -437,9 +437,8 @@ class Session:
         """Lean (x, y) of each view's board in degrees: where its far side is, right and down."""
         if self.fit is None:
             return []
-        R = self.fit.calibration.block.R_CT
         # Where a step towards (x, y) leads away from the camera, the normal leans the other way.
-        normals = -R[:, :, 2] * np.sign(R[:, 2:, 2])
+        normals = -self.fit.calibration.block.normals
         tilt = np.degrees(np.arccos(np.clip(-normals[:, 2], -1.0, 1.0)))
         along = normals[:, :2] / np.maximum(np.linalg.norm(normals[:, :2], axis=1, keepdims=True), 1e-9)
         lean = np.round(tilt[:, None] * along, 1)

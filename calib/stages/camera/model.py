@@ -551,6 +551,14 @@ class Block:
         known = np.isfinite(self.R_CT).all(axis=(1, 2)) & np.isfinite(self.t_CT_m).all(axis=1)
         return np.asarray(known)
 
+    @property
+    def normals(self) -> FloatArray:
+        """Normals (N, 3) of the target's planes, away from the camera.
+
+        A mirrored list of points turns a board's back to the camera; its plane leans the same way.
+        """
+        return np.asarray(self.R_CT[:, :, 2] * np.where(self.R_CT[:, 2, 2:] < 0.0, -1.0, 1.0))
+
     def part(self, views: slice | IntArray | Sequence[int]) -> Block:
         """The same with the poses of some views only."""
         return replace(self, R_CT=self.R_CT[views], t_CT_m=self.t_CT_m[views])

@@ -252,8 +252,7 @@ def _poses(fit: Calibration) -> Figure:
         "Boards that stand parallel to each other say the same about the camera. A good set leans to all "
         "sides, by 20 to 50 degrees, and so fills the panel at the right."
     )
-    normals = fit.block.R_CT[usable, :, 2]
-    normals = normals * np.where(normals[:, 2:] < 0.0, -1.0, 1.0)
+    normals = fit.block.normals[usable]
     colours = spaced(fit.observations.views)[usable]
     title = "How the boards leaned before the camera"
     return Figure(title, note, _tilts(normals, colours), 4.0, columns=2)

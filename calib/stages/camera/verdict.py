@@ -417,9 +417,7 @@ def _of_coverage(calibration: Calibration) -> Iterator[Finding]:
     """Tilts, size in the picture, and the part of the picture that was covered."""
     observations = calibration.observations
     width, height = calibration.camera.image_size_px
-    R_CT = calibration.block.R_CT
-    # A mirrored list of points turns the board's back to the camera; its plane leans the same way.
-    normals = R_CT[:, :, 2] * np.where(R_CT[:, 2, 2:] < 0.0, -1.0, 1.0)
+    normals = calibration.block.normals
     # Exact for few views, and to a degree for many.
     some = normals[:: max(1, len(normals) // _MOST_NORMALS)]
     spread_deg = float(np.degrees(np.arccos(np.clip((some @ some.T).min(), -1.0, 1.0))))
