@@ -280,6 +280,13 @@ def _cell(value: Any, scale: float, places: int | None) -> str:
     return _word(value) if isinstance(value, bool | str) else number(_scaled(value, scale), None, places)
 
 
+def several(names: Sequence[str], most: int = 6) -> str:
+    """Names for a sentence, each once, those beyond `most` counted."""
+    names = list(dict.fromkeys(names))
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
     """Parts of one kind as a table, a row for each, with their names in front where they have some."""
     named = parts if isinstance(parts, Mapping) else {str(i): one for i, one in enumerate(parts)}

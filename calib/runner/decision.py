@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
 from calib.core.files import read_text
 from calib.core.verdict import POOR, Word
+from calib.core.words import several
 
 # ----------------------------------------------------------------------
 # run.json: what a run tells the page, read from a folder that may come from anywhere.
@@ -175,16 +176,9 @@ def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> lis
             titles.append(str(job["title"]))
             logs += [str(job["log"])] if job["log"] else []
     return [
-        f"{_few(titles)}{f' ({_few(logs)})' if logs else ''}: {reason}"
+        f"{several(titles, _SHOWN)}{f' ({several(logs, _SHOWN)})' if logs else ''}: {reason}"
         for reason, (titles, logs) in grouped.items()
     ]
-
-
-def _few(names: Sequence[str]) -> str:
-    """The first names, each once, and how many there are beside them."""
-    listed = list(dict.fromkeys(names))
-    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
-    return ", ".join(listed[:_SHOWN]) + more
 
 
 def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:

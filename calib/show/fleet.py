@@ -13,7 +13,7 @@ from calib.core import __version__
 from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
 from calib.core.units import unit_of
 from calib.core.verdict import POOR
-from calib.core.words import BLANK, SIGMA, as_words, number
+from calib.core.words import BLANK, SIGMA, as_words, number, several
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
 from calib.runner.sweep import Point, Sweep, SweepSummary
@@ -126,10 +126,8 @@ def _answer(summary: FleetSummary) -> tuple[str, str]:
     if standing:
         parts.append(f"{standing} value{'s stand' if standing > 1 else ' stands'} out against the fleet")
     if drifting:
-        more = "" if len(drifting) <= 3 else f" and {len(drifting) - 3} more"
-        parts.append(
-            f"{', '.join(drifting[:3])}{more} drift{'s' if len(drifting) == 1 else ''} with the serial number"
-        )
+        drift = "drifts" if len(drifting) == 1 else "drift"
+        parts.append(f"{several(drifting, 3)} {drift} with the serial number")
     if not parts:
         return "yes", f"all {summary.rigs} rigs are ok, and none stands out"
     return ("no" if bad else "not-yet"), "; ".join(parts)

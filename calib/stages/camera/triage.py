@@ -34,6 +34,7 @@ from itertools import combinations
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.words import several
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
 from calib.stages.camera.checks import (
@@ -46,7 +47,7 @@ from calib.stages.camera.checks import (
     scaled_inverse,
 )
 from calib.stages.camera.model import Block, LeftOut, Observations, project, scale_of
-from calib.stages.camera.verdict import Limits, far_points, listed, quiet_rms
+from calib.stages.camera.verdict import Limits, far_points, quiet_rms
 
 _LEAST_VIEWS = 5
 """Views below which none can be told to disagree with the others."""
@@ -545,7 +546,7 @@ def _of_points(distance: FloatArray, everything: Observations, far: BoolArray) -
     out = []
     for i in np.flatnonzero(far.any(axis=1)):
         lost = np.flatnonzero(far[i])
-        where = listed(
+        where = several(
             [
                 f"{j} at ({u:.1f}, {v:.1f})"
                 for j, (u, v) in zip(lost, everything.pixels[i, lost], strict=True)

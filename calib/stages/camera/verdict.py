@@ -24,6 +24,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.geometry import box_grid
 from calib.core.verdict import Finding, Severity, Verdict
+from calib.core.words import several
 from calib.stages.camera.bundle import (
     Calibration,
     Covariance,
@@ -54,13 +55,6 @@ from calib.stages.camera.checks import (
     widened,
 )
 from calib.stages.camera.model import LeftOut, Observations, scale_of
-
-
-def listed(names: Sequence[str], most: int = 6) -> str:
-    """Names for a sentence, the rest counted."""
-    if len(names) <= most:
-        return ", ".join(names)
-    return ", ".join(names[:most]) + f" and {len(names) - most} more"
 
 
 class Limits:
@@ -356,8 +350,8 @@ def of_faults(observations: Observations) -> Iterator[Finding]:
         if len(some) == len(faults):
             yield Finding("unidentifiable", f"All views show {what}.")
         elif some:
-            text = f"{listed(some)} {'shows' if len(some) == 1 else 'show'} {what}."
-            yield Finding("inconsistent", text, f"Leave out {listed(some)}.")
+            text = f"{several(some)} {'shows' if len(some) == 1 else 'show'} {what}."
+            yield Finding("inconsistent", text, f"Leave out {several(some)}.")
 
 
 def of_leaving(
@@ -386,7 +380,7 @@ def of_leaving(
         share = len(some) / (used + len(some))
         text = (
             f"{len(some)} of {used + len(some)} pictures {'is' if len(some) == 1 else 'are'} {what}: "
-            f"{listed([one.name for one in some], 20)}"
+            f"{several([one.name for one in some], 20)}"
         )
         many = share > Limits.leaving_bad and not (some is views and moved_px < Limits.leaving_px)
         if many:
@@ -399,7 +393,7 @@ def of_copies(copies: Sequence[LeftOut]) -> Iterator[Finding]:
     if copies:
         one = len(copies) == 1
         text = (
-            f"{listed([one.name for one in copies], 20)} {'shows' if one else 'show'} the board where "
+            f"{several([one.name for one in copies], 20)} {'shows' if one else 'show'} the board where "
             f"another picture does and {'is' if one else 'are'} left out: the same place once more lowers "
             "the standard deviations on paper only."
         )
@@ -468,7 +462,7 @@ def _of_frame(calibration: Calibration) -> Iterator[Finding]:
         fewer = mirrored if mirrored.mean() <= 0.5 else ~mirrored
         names = [calibration.observations.names[i] for i in np.flatnonzero(fewer)]
         text = (
-            f"{listed(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to "
+            f"{several(names)} {'shows' if len(names) == 1 else 'show'} the board mirrored with respect to "
             "the other views: the points are listed in another order."
         )
         yield Finding("inconsistent", text, "Give the points of all views in the same order.")
@@ -496,7 +490,7 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
     bad = rms > max(Limits.view_bad * quiet_rms(rms), Limits.point_floor_px)
 
     def with_rms(which: Sequence[int]) -> str:
-        return listed([f"{names[i]} ({rms[i]:.2f} px)" for i in which], 4)
+        return several([f"{names[i]} ({rms[i]:.2f} px)" for i in which], 4)
 
     if bad.any():
         worse, good = [i for i in np.argsort(-rms).tolist() if bad[i]], float(np.median(rms[~bad]))
@@ -504,7 +498,7 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
             f"{with_rms(worse)} {'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is "
             f"{good:.2f} px: misplaced corners, another board, or motion during the exposure."
         )
-        advice = f"Leave out {listed([names[i] for i in worse], 4)}, or look at the corners there."
+        advice = f"Leave out {several([names[i] for i in worse], 4)}, or look at the corners there."
         yield Finding("inconsistent", text, advice)
     elif np.any(odd := rms > max(Limits.view_remark * typical, 0.1)):
         text = (
@@ -557,7 +551,7 @@ def _of_points(distance: FloatArray, fine: BoolArray, names: tuple[str, ...]) ->
     count = int(bad.sum())
     if count:
         share = count / int(fine.sum())
-        where = listed([names[i] for i in np.flatnonzero(bad.any(axis=1))])
+        where = several([names[i] for i in np.flatnonzero(bad.any(axis=1))])
         text = (
             f"{count} point{'s lie' if count > 1 else ' lies'} more than {Limits.point_factor:.0f} times the "
             f"median error off, in {where} ({100 * share:.1f} % of all; at most "
@@ -613,7 +607,7 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
         f"by {found.apart_px:.1f} px; the RMS falls from {calibration.rms_px:.3f} to "
         f"{found.split_rms_px:.3f} px, {found.ratio:.1f} times what chance explains)"
     )
-    second = listed([names[i] for i in np.flatnonzero(found.second)], 20)
+    second = several([names[i] for i in np.flatnonzero(found.second)], 20)
     if not telling:
         text = (
             f"{second} would have a camera of their own {sure}, but not one "
