@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,11 +74,10 @@ BOARDS = ("rigid", "warp", "released")
 """Board models: flat with nominal corners; a paraboloid of two bows; every corner free."""
 
 _FOLDS = 6
-_MAX_ITERATIONS = 40
 _MANY = 40
 """Views from which on evidence tells the rational model's error on views held back to about a percent."""
-_ENOUGH = 1e-2
-"""Of a standard deviation: far more than a comparison of held-back views needs."""
+_ROUGHLY: dict[str, Any] = {"max_iterations": 40, "tolerance": 1e-2}
+"""How far a fit goes: a hundredth of a standard deviation, far more than a comparison of views needs."""
 _CHANCE = 0.023
 """Probability of a win by chance below which a richer model wins; two standard errors of many views."""
 _GAIN_PX = 0.005
@@ -237,7 +236,7 @@ def _on_fold(fits: Sequence[Calibration], job: tuple[int, IntArray]) -> FloatArr
     whole, held = fits[job[0]], job[1]
     observations = whole.observations
     kept = np.setdiff1d(np.arange(observations.views, dtype=np.int64), held)
-    fit = refitted(whole, kept, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
+    fit = refitted(whole, kept, **_ROUGHLY)
     # A direction that a fold leaves flat makes "iterations" usual for rich models; its error counts.
     if fit.termination in ("behind the camera", "singular"):
         return np.full(len(held), np.nan)
@@ -279,16 +278,7 @@ def candidates_by_model(
     def fitted(model: str, start: Block | None) -> Calibration | None:
         if 2 * observations.points < len(free_intrinsics(model, skew)) + 6 * observations.views + 1:
             return None
-        fit = calibrate(
-            observations,
-            image_size_px,
-            model,
-            skew=skew,
-            loss=loss,
-            start=start,
-            max_iterations=_MAX_ITERATIONS,
-            tolerance=_ENOUGH,
-        )
+        fit = calibrate(observations, image_size_px, model, skew=skew, loss=loss, start=start, **_ROUGHLY)
         return None if fit.termination in ("behind the camera", "singular") else fit
 
     for model in MODELS:
@@ -328,7 +318,7 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
     if all(sound):
         return fit
     observations, size = fit.observations, fit.camera.image_size_px
-    fitted = partial(refitted, fit, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
+    fitted = partial(refitted, fit, **_ROUGHLY)
     starts = [equidistant_start(observations, size, share * max(size)) for share in _EQUIDISTANT]
     starts = [start for start in starts if start.posed.all()]
     if simpler:
@@ -619,7 +609,7 @@ def without_copies(
     first = repeated_views(observations, max(image_size_px))
     if len(np.unique(first)) == len(first):
         return observations, []
-    fit = calibrate(observations, image_size_px, _ROUGH, max_iterations=_MAX_ITERATIONS, tolerance=_ENOUGH)
+    fit = calibrate(observations, image_size_px, _ROUGH, **_ROUGHLY)
     rms = np.nan_to_num(np.round(fit.view_rms_px, 6))
     order = np.lexsort((rms, -observations.present.sum(axis=1)))
     place, best = np.unique(first[order], return_index=True)

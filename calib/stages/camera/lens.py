@@ -455,17 +455,16 @@ def radial_sigma(camera: Camera, covariance: Covariance, radius_px: FloatArray) 
     if not np.all(np.isfinite(covariance.intrinsics)):
         return np.full(len(radius_px), np.inf)
     vector = vector_from_camera(camera)
+
+    def displacement(step: FloatArray) -> FloatArray:
+        moved = camera_from_vector(camera.model, camera.image_size_px, vector + step)
+        return radial_displacement(moved, radius_px)
+
     rows = []
     for name, sigma in covariance.sigma().items():
         step = np.zeros(len(vector))
         step[INTRINSICS.index(name)] = 1e-4 * sigma or 1e-9
-        ahead, behind = (
-            radial_displacement(
-                camera_from_vector(camera.model, camera.image_size_px, vector + sign * step), radius_px
-            )
-            for sign in (1.0, -1.0)
-        )
-        rows.append((ahead - behind) / (2.0 * step.sum()))
+        rows.append((displacement(step) - displacement(-step)) / (2.0 * step.sum()))
     J = np.array(rows).reshape(-1, len(radius_px))
     variance = np.einsum("pr,pq,qr->r", J, covariance.intrinsics, J)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
