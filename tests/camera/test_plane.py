@@ -271,7 +271,7 @@ def test_derivatives_against_finite_differences(model: str) -> None:
 
 
 def test_pose_derivatives_against_finite_differences() -> None:
-    _, by_world, by_pose, _ = pose_derivatives(RICH, R_TRUE_POSE, T_TRUE_POSE, POINTS_POSE)
+    by_world, by_pose, _ = pose_derivatives(RICH, R_TRUE_POSE, T_TRUE_POSE, POINTS_POSE)
 
     def moved(step: np.ndarray) -> np.ndarray:
         return project(

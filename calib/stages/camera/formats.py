@@ -216,6 +216,13 @@ FILES = {
 """Kinds of files by the names of the formats."""
 
 
+def _coefficients(camera: Camera) -> FloatArray:
+    """What a file holds: four of a fisheye lens, eight where the rational model needs them, else five."""
+    if camera.fisheye:
+        return camera.distortion[_FISHEYE]
+    return camera.distortion if np.any(camera.distortion[_BROWN:]) else camera.distortion[:_BROWN]
+
+
 def to_ros(camera: Camera, name: str = "camera") -> str:
     """ROS camera_info YAML (sensor_msgs/CameraInfo).
 
@@ -223,11 +230,8 @@ def to_ros(camera: Camera, name: str = "camera") -> str:
 
     The rectification is the identity and the projection matrix K, as for a single camera.
     """
-    model, coefficients = "plumb_bob", camera.distortion[:_BROWN]
-    if camera.fisheye:
-        model, coefficients = "equidistant", camera.distortion[_FISHEYE]
-    elif np.any(camera.distortion[_BROWN:]):
-        model, coefficients = "rational_polynomial", camera.distortion
+    coefficients = _coefficients(camera)
+    model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[len(coefficients)]
     P = np.column_stack([camera.K, np.zeros(3)])
     document = {
         "image_width": int(camera.image_size_px[0]),
@@ -280,11 +284,9 @@ def to_opencv(camera: Camera) -> str:
     storage.write("image_width", int(camera.image_size_px[0]))
     storage.write("image_height", int(camera.image_size_px[1]))
     storage.write("camera_matrix", camera.K)
-    used = len(COEFFICIENTS) if np.any(camera.distortion[_BROWN:]) else _BROWN
-    coefficients = camera.distortion[_FISHEYE] if camera.fisheye else camera.distortion[:used]
     if camera.fisheye:
         storage.write("fisheye_model", 1)
-    storage.write("distortion_coefficients", coefficients[:, None])
+    storage.write("distortion_coefficients", _coefficients(camera)[:, None])
     return str(storage.releaseAndGetString())
 
 

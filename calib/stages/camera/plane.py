@@ -89,7 +89,7 @@ def position_sigma(
     points_m : (N, 2) places on the plane.
     """
     seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m)
-    _, by_world, by_pose, by_camera = pose_derivatives(camera, pose.R_CW, pose.t_CW_m, points_m[seen])
+    by_world, by_pose, by_camera = pose_derivatives(camera, pose.R_CW, pose.t_CW_m, points_m[seen])
     to_world = 1e3 * np.linalg.inv(by_world)
 
     def deviation(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -92,16 +92,16 @@ def projection_with_derivatives(
 
 def pose_derivatives(
     camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, world_m: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pixels (M, 2) of world points (M, 2), and derivatives by world point, pose and intrinsics.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives of the pixels of world points (M, 2), by world point, pose and intrinsics.
 
-    Shapes of the derivatives: (M, 2, 2), (M, 2, 6), (M, 2, 13).
+    Shapes: (M, 2, 2), (M, 2, 6), (M, 2, 13).
     """
     rotated = world_m @ R_CW[:, :2].T
-    pixels, by_point, by_camera = projection_with_derivatives(camera, rotated + t_CW_m)
+    _, by_point, by_camera = projection_with_derivatives(camera, rotated + t_CW_m)
     # a . (w x q) = w . (q x a): row by row of by_point.
     by_w = np.cross(rotated[:, None, :], by_point)
-    return pixels, by_point @ R_CW[:, :2], np.concatenate([by_w, by_point], axis=2), by_camera
+    return by_point @ R_CW[:, :2], np.concatenate([by_w, by_point], axis=2), by_camera
 
 
 def fit_pose(camera: Camera, world_m: FloatArray, pixels: FloatArray, groups: IntArray | None = None) -> Pose:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -585,7 +585,7 @@ def read_table(path: Path) -> list[View]:
         another length, a point of the target given twice in a view, a view with fewer than four
         points, or a file that is empty or not text.
     """
-    views: dict[str, _Points] = {}
+    views: defaultdict[str, _Points] = defaultdict(_Points)
     where: list[int] = []
     width = 0
     for line, text in _lines(path):
@@ -600,9 +600,7 @@ def read_table(path: Path) -> list[View]:
         name = cells[where[0]].strip()
         if not name:
             raise _at(path, line, "view is empty, expected a name")
-        points = views.get(name)
-        if points is None:
-            points = views[name] = _Points()
+        points = views[name]
         points.values.extend(_numbers(text, [cells[i] for i in where[1:]], path, line))
         points.lines.append(line)
     if not where:
