@@ -390,14 +390,8 @@ def initial_guess(observations: Observations, image_size_px: tuple[int, int], sk
 
 def _plausible(K: FloatArray, longest: float, centre: FloatArray) -> bool:
     """Focal lengths between a fifth and fifty times the image, principal point near the image."""
-    focal = np.array([K[0, 0], K[1, 1]])
-    near = np.abs(K[:2, 2] - centre) < longest
-    return bool(
-        np.all(np.isfinite(K))
-        and np.all(focal > 0.2 * longest)
-        and np.all(focal < 50 * longest)
-        and near.all()
-    )
+    focal, off = np.diag(K)[:2] / longest, np.abs(K[:2, 2] - centre) / longest
+    return bool(np.all(np.isfinite(K)) and np.all((focal > 0.2) & (focal < 50.0) & (off < 1.0)))
 
 
 # ----------------------------------------------------------------------

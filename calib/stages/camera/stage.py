@@ -301,6 +301,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
     )
     sigma = np.sqrt(np.diag(fit.covariance))
     names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
+    parts = ("intrinsics", "plane", "calibration", "quantisation", "total")
 
     def largest(values: FloatArray | None) -> float | None:
         if values is None or not np.isfinite(values).any():
@@ -328,13 +329,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         sigma=dict(zip(names, (finite_or_none(s) for s in sigma), strict=True)),
         rms_px=fit.rms_px,
         rms_mm=fit.rms_mm,
-        sigma_marker_mm={
-            "intrinsics_max": largest(fit.sigma.intrinsics_mm),
-            "plane_max": largest(fit.sigma.plane_mm),
-            "calibration_max": largest(fit.sigma.calibration_mm),
-            "quantisation_max": largest(fit.sigma.quantisation_mm),
-            "total_max": largest(fit.sigma.total_mm),
-        },
+        sigma_marker_mm={f"{part}_max": largest(getattr(fit.sigma, f"{part}_mm")) for part in parts},
         without_intrinsics=without,
         pictures=len(fit.pictures),
         points=len(fit.corners_m),

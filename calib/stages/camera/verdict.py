@@ -466,11 +466,8 @@ def _of_frame(calibration: Calibration) -> Iterator[Finding]:
             "the other views: the points are listed in another order."
         )
         yield Finding("inconsistent", text, "Give the points of all views in the same order.")
-    width, height = camera.image_size_px
-    off = max(
-        abs(camera.cx_px - 0.5 * (width - 1)) / width,
-        abs(camera.cy_px - 0.5 * (height - 1)) / height,
-    )
+    width, height = size = camera.image_size_px
+    off = float(np.max(np.abs(camera.centre_px - 0.5 * (np.array(size) - 1)) / size))
     if off > Limits.centre_remark:
         swapped = bool(mirrored.all()) and width != height
         why = "u and v may be swapped" if swapped else "the picture is cropped, or its size is wrong"
