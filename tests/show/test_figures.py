@@ -134,7 +134,6 @@ def _unbounded() -> Intrinsics:
         result.covariance,
         intrinsics=np.diag(np.full(size, np.inf)),
         joint=np.diag(np.full(size + 6, np.inf)),
-        poses=np.full_like(result.covariance.poses, np.inf),
     )
     return replace(result, covariance=found)
 
