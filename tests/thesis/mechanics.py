@@ -489,7 +489,7 @@ def _track(phi_rad: float) -> Track:
 @once
 def fitted() -> Solution:
     """The improved model: the parameters of Table 3.2 from three swings, of which none is shown."""
-    return fit_tracks(Machine(), [_track(phi) for phi in _FITTED_RAD], delay_s=0.0, threads=1)
+    return fit_tracks(Machine(), [_track(phi) for phi in _FITTED_RAD], delay_s=0.0)
 
 
 def fitted_rig() -> SimulatedRig:
