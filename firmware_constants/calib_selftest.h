@@ -9,7 +9,7 @@
 
 #include "calib_pipeline.h"
 
-#if CALIB_ID != 0xD73D0674UL
+#if CALIB_ID != 0x6D08E779UL
 #error "calib: calib_selftest.h is of another rig than calib_constants.h"
 #endif
 #if CALIB_UNDISTORT != 1

@@ -79,7 +79,7 @@ def _tell(found: RigDiff, every: bool) -> None:
         say("verdict of {section}: {before} before, {after} after".format(**one))
     plane = found.plane
     if plane is None:
-        say("no plane in both: no difference in millimetres")
+        say("no plane in both, or pictures of two sizes: no difference in millimetres")
     else:
         bar = "" if not plane.sigma_mm else f", sigma {plane.sigma_mm:.4f} mm"
         say(

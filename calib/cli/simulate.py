@@ -24,6 +24,9 @@ def _options(settings: list[str]) -> dict[str, str]:
     return options
 
 
+_MOST_S = 86400.0
+
+
 def simulate(
     scenario: Annotated[
         str,
@@ -59,6 +62,8 @@ def simulate(
         raise UsageError(f"--feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
     options = _options(settings or [])
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
+    if duration_s is not None and duration_s > _MOST_S:
+        raise UsageError(f"--duration: found {duration_s:g} s, expected at most a day, {_MOST_S:g} s")
     machine = SimulatedRig()
     if rig is not None:
         from calib.core.rig import Rig

@@ -109,10 +109,11 @@ class Geometry(Section):
 
 
 class Provenance(Section):
-    """Version and the SHA-256 of each input by section and name."""
+    """Version, SHA-256 of each input by section and name, and of each section as its verb wrote it."""
 
     version: str = __version__
     inputs: dict[str, dict[str, str]] = {}
+    written: dict[str, str] = {}
 
 
 @lru_cache(maxsize=64)
@@ -205,6 +206,12 @@ class Rig:
             if schema > 1 or name not in ("actuator", "pump"):
                 where = "actuator" if bends and name == "arm" else name
                 setattr(rig, name, validated(kind_of(name), values, source, where))
+        # What is a section's identity may change with the version.
+        if rig.provenance.version == __version__:
+            for name, digest in rig.provenance.written.items():
+                one = getattr(rig, name, None)
+                if isinstance(one, Result):
+                    one.sealed(digest)
         if schema == 1 and ("actuator" in sections or "pump" in sections):
             from calib.stages.actuator.section import parted
 
@@ -225,6 +232,9 @@ class Rig:
             plant_from({key: value for key, (value, _) in parts["actuator"].items()})
         except BadInputError as error:
             raise BadInputError(f"{shown(source)}: actuator: {error}") from error
+        strength, _ = parts["pump"].get("strength", ([1.0], None))
+        if min(strength) <= 0.0:
+            raise BadInputError(f"{shown(source)}: pump.strength is {strength}, expected both above 0")
         supply, _ = parts["pump"].get("supply_V", (SUPPLY_V, None))
         dead, _ = parts["pump"].get("dead_zone_V", (0.0, None))
         if dead > supply:
@@ -270,7 +280,8 @@ class Rig:
         """What `save` writes."""
         merged = {**self.inputs, **(inputs or {})}
         ordered = {name: dict(sorted(merged[name].items())) for name in sorted(merged)}
-        self.provenance, self.schema = Provenance(inputs=ordered), SCHEMA
+        written = {name: one.sealed() for name, one in self.sections.items() if isinstance(one, Result)}
+        self.provenance, self.schema = Provenance(inputs=ordered, written=written), SCHEMA
         # What a program has set may be anything, and a file that cannot be read back helps nobody.
         Rig.of({"schema": SCHEMA, **self.values()}, path)
         return self.text()
@@ -307,7 +318,9 @@ class Rig:
         from calib.core.diff import compared, plane_change
 
         plane = None
-        if self.camera and other.camera and self.plane and other.plane:
+        # Pictures of two sizes have no pixels in common.
+        alike = self.picture_px == other.picture_px
+        if self.camera and other.camera and self.plane and other.plane and alike:
             seen, read = (self.plane, self.camera), (other.plane, other.camera)
             plane = plane_change(
                 lambda world_m: seen[0].to_pixels(world_m, seen[1]),
@@ -322,6 +335,12 @@ class Rig:
         """Where the marker can be: least x, least y, greatest x, greatest y."""
         x0, y0, x1, y1 = (self.geometry or Geometry()).workspace_m
         return x0, y0, x1, y1
+
+    @property
+    def middle_m(self) -> tuple[float, float]:
+        """The middle of the workspace, about which an alignment's stretch magnifies."""
+        x0, y0, x1, y1 = self.workspace_m
+        return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
 
     @property
     def picture_px(self) -> tuple[int, int] | None:
@@ -361,7 +380,7 @@ class Rig:
         """A section. Raises `BadInputError`, which says the verb that makes it, where there is none."""
         section = getattr(self, name)
         if section is None:
-            raise BadInputError(f"{shown(source)}: has no {name} yet{why}; run calib {_FIRST[name]} first")
+            raise BadInputError(f"{shown(source)}: has no {name} yet{why}; run calib {VERBS[name]} first")
         return section
 
     def current_plane(self, source: Path | str) -> Plane | None:
@@ -383,38 +402,62 @@ class Rig:
         return self.plane
 
     def identities(self, *names: str) -> dict[str, str]:
-        """SHA-256 of these sections, of those that there are, to note what was computed from them."""
+        """SHA-256 of these sections to note what was computed from them; empty for one that there is not."""
         found = {name: getattr(self, name) for name in names}
-        return {name: identity(section) for name, section in found.items() if section is not None}
+        return {name: "" if section is None else identity(section) for name, section in found.items()}
 
-    def outdated(self, *but: str) -> list[str]:
-        """Sentences for sections, all but these, that were computed from others than the rig now has."""
-        there = [name for name in _AGAIN if name not in but and getattr(self, name) is not None]
+    def outdated(self, names: Iterable[str] | None = None) -> list[str]:
+        """Sentences for sections of these, or of all, that do not say what their verb would say now.
+
+        They were computed from others than the rig has now, or were changed after the verb wrote them.
+        """
+        there = {name: getattr(self, name) for name in (VERBS if names is None else names) if name in VERBS}
+        there = {name: one for name, one in there.items() if isinstance(one, Result)}
         known = {name: self.inputs.get(name, {}) for name in there}
         now = self.identities(*(name for name in KINDS if any(name in inputs for inputs in known.values())))
         sentences = []
         for name, inputs in known.items():
-            verb = _AGAIN[name]
+            what, again = name.replace("_", " "), f"run calib {VERBS[name]} again"
             changed = [
-                other.replace("_", " ") for other in now if inputs.get(other, now[other]) != now[other]
+                # One that is not here may only not have been handed over.
+                other.replace("_", " ")
+                for other in now
+                if now[other] and inputs.get(other, now[other]) != now[other]
             ]
-            if changed:
-                what = f"{name.replace('_', ' ')} in the file is of an earlier {' and '.join(changed)}"
-                sentences.append(f"{what}; run calib {verb} again")
+            earlier = [other for other in changed if other not in _STATED]
+            if earlier:
+                sentences.append(f"{what} in the file is of an earlier {' and '.join(earlier)}; {again}")
+            elif changed:
+                sentences.append(f"{what} in the file is older than {' and '.join(changed)}; {again}")
+            if there[name].changed:
+                sentences.append(
+                    f"{what} in the file was changed after calib had written it, so that its verdict is of "
+                    f"other values; {again}"
+                )
         return sentences
+
+    def doubts(self, names: Iterable[str]) -> list[str]:
+        """Sentences for sections of these that nothing computed from them can be better than."""
+        sections = {name: getattr(self, name) for name in names if name in VERBS}
+        poor = [
+            f"{name.replace('_', ' ')} is {one.verdict.word}"
+            for name, one in sections.items()
+            if isinstance(one, Result) and not one.verdict.ok
+        ]
+        no_better = [f"{', '.join(poor)}; what follows from it is no better"] if poor else []
+        return [*no_better, *self.outdated(sections)]
 
 
 _MOST_OFF_PX = 0.01
-_FIRST = {
-    "camera": "intrinsics", "plane": "extrinsics", "imu": "imu static", "align": "align",
-    "arm": "identify arm",
+_STATED = ("known", "geometry")
+"""What a person states."""
+VERBS = {
+    "camera": "intrinsics", "plane": "extrinsics", "lens": "distortion", "imu": "imu static",
+    "imu_intrinsics": "imu intrinsics", "orientation_filter": "imu tune", "lowpass": "lowpass",
+    "align": "align", "actuator": "identify", "pump": "identify", "arm": "identify arm",
+    "estimator": "replay --tune", "controller": "control tune",
 }  # fmt: skip
-"""Verb that makes a section which another needs."""
-_AGAIN = {
-    "plane": "extrinsics", "lens": "distortion", "lowpass": "lowpass", "orientation_filter": "imu tune",
-    "align": "align", "actuator": "identify", "pump": "identify", "controller": "control tune",
-}  # fmt: skip
-"""Verb that computes a section which follows from others."""
+"""Verb that computes a section."""
 
 
 def kind_of(name: str) -> type[BaseModel]:

@@ -111,7 +111,8 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
     if how == "contradiction":
         return f"{key}.{first['msg']}"
     if how == "missing":
-        return f"{key} is missing"
+        made_up = "; calib writes it, and of a section that you make up it is ok"
+        return f"{key} is missing{made_up if place[-1] == 'verdict' else ''}"
     if how in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{key} is not a key that is known here{nearest(str(place[-1]), around.get('properties', {}))}"
     message = first["msg"]

@@ -192,7 +192,7 @@ class Stage:
     remarks: Callable[[Rig], Sequence[str]] | None = None
 
     def run(self, files: Files, rig: Rig, options: Any) -> Any:
-        """Read and solve; every result knows the hashes of its inputs.
+        """Read and solve; every result knows the hashes of its inputs, and is no better than they are.
 
         Raises `BadInputError` where a section is missing, or where the answer is none that rig.yaml holds.
         """
@@ -215,8 +215,11 @@ class Stage:
             raise BadInputError(
                 f"{names}: no useful answer follows{told}{which if len(files.paths) > 1 else ''}"
             ) from error
-        for result in self.results(outcome):
-            result.made_by(self.name, files.hashes)
+        results, doubts = self.results(outcome), rig.doubts(files.hashes)
+        for result in results:
+            result.made_by(self.name, files.hashes).doubt(doubts)
+        for sentence in () if results else doubts:
+            files.narrate(sentence)
         return outcome
 
     def sections(self, outcome: Any) -> dict[str, Result]:

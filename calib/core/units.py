@@ -65,12 +65,6 @@ UNITS = {
 }
 
 
-def rounded_down(value: float, digits: int) -> float:
-    """A value that is not negative, down to so many significant digits."""
-    power = math.floor(math.log10(value)) - digits + 1 if value else 0
-    return float(f"{math.floor(value / 10.0**power + 1e-9)}e{power}")
-
-
 def unit_of(key: str) -> str:
     """Unit at the end of a key, "" for a number without one."""
     return next((unit for end, unit in UNITS.items() if key.endswith(end)), "")

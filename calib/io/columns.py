@@ -622,6 +622,8 @@ def _with_accel(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMa
     fits = bool(unit) and least <= norm * units[unit] / GRAVITY_MPS2 <= _STRANGE_G[1]
     if likely and not (fits and len(names) == 2 and columns.sources[names[0]].stated != "name"):
         advice = _advice("acc", "accel", likely[0], columns)
+        # Two per cent lie between them, and more in how level a rig stands.
+        advice += ", or for cm/s^2 each axis with factor: 0.01" if likely[0] == "mg" else ""
         raise BadInputError(f"{columns.source}: {found}, so it is in {likely[0]}, not in {unit}; {advice}")
     if fits:
         # Two axes may be far from the vertical, and a short log be never calm.

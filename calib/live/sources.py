@@ -111,25 +111,29 @@ class Capture:
 
 
 class Watched:
-    """Pictures that appear in a folder, one after the other, those that are there first."""
+    """Pictures that appear in a folder, one after the other, those that are there first.
+
+    One that changes is looked at again: what comes over a network may stand still half-written.
+    """
 
     single = True
 
     def __init__(self, folder: Path, now: Callable[[], float] = time.time) -> None:
         self.fault, self._folder, self._now = "", folder, now
-        self._done: set[str] = set()
+        self._done: dict[str, tuple[int, int]] = {}
 
     def read(self) -> AnyArray | None:
         """As `Source.read`."""
         there = list_pictures([self._folder]) if holds_pictures(self._folder) else []
         for path in there:
             try:
-                settled = self._now() - path.stat().st_mtime > _SETTLED_S
+                found = path.stat()
             except OSError:
                 continue
-            if path.name in self._done or not settled:
+            stamp = found.st_size, found.st_mtime_ns
+            if self._done.get(path.name) == stamp or self._now() - found.st_mtime <= _SETTLED_S:
                 continue
-            self._done.add(path.name)
+            self._done[path.name] = stamp
             self.fault = ""
             try:
                 data = read_bytes(path)
@@ -140,7 +144,7 @@ class Watched:
             if 0 < (declared_pixels(data) or 0) <= MOST_PIXELS:
                 frame = decode(data)
             if frame is None:
-                self.fault = f"{shown(path)} is not a picture that can be decoded."
+                self.fault = f"{shown(path)} is not a picture that can be decoded (yet)."
             return frame
         time.sleep(_LOOK_AGAIN_S)
         return None

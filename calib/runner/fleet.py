@@ -212,7 +212,7 @@ def twice_told(rigs: Iterable[RigSpec]) -> tuple[str, ...]:
 
 def _from_csv(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
     cells = read_cells(path, comments=False)
-    head = cells.header
+    head = [name.strip().lower() for name in cells.header]
     for name in ("name", "path"):
         if name not in head:
             found = one_line(", ".join(head))[:80]

@@ -298,6 +298,8 @@ class Runner:
         jobs = list(jobs_of(self.folder, self.steps))
         self._before = {path: _stamp(path) for path in self.folder.files()}
         self._digests = folder_digests(self.folder)
+        if self._of_others():
+            self.tell(f"{shown(self.out)}: held the results of other pictures and logs, which these replace")
         if self.folder.rig is not None:
             learnt = {name for job in jobs if not job.status for name in job.step.writes}
             base = Rig.load(self.folder.rig)
@@ -320,6 +322,14 @@ class Runner:
                     self._end(self._stored(job, key, EXIT_INTERNAL if isinstance(code, Failure) else code))
             self.progress(len(self.ended), len(jobs))
         return [self.ended[job.name] for job in jobs]
+
+    def _of_others(self) -> bool:
+        """Whether results are there, and none of the files that are read now has gone into them."""
+        try:
+            before = (self.out / "rig.yaml").read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return False
+        return "inputs:" in before and not any(one in before for one in self._digests.values())
 
     def rig(self) -> Rig:
         """All that is known: what the person told and what the stages have learnt."""

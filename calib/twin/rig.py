@@ -61,12 +61,15 @@ def rig_from_file(rig: Rig) -> SimulatedRig:
     if rig.plane is not None:
         view = replace(view, R_CW=np.array(rig.plane.R_CW), t_CW_m=np.array(rig.plane.t_CW_m))
     twin = rig.twin or Twin()
+    tracker = twin.tracker
+    if rig.geometry is not None and tracker.marker_offset_m == Tracker.marker_offset_m:
+        tracker = replace(tracker, marker_offset_m=rig.geometry.marker_offset_m)
     return SimulatedRig(
         machine.plant,
         machine.free_damping_scale,
         machine.pump,
         machine.strength,
         view,
-        twin.tracker,
+        tracker,
         twin.imu,
     )

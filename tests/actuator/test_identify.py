@@ -20,6 +20,7 @@ from calib.stages.actuator.identify import (
     Solution,
     Start,
     Track,
+    by_logs,
     colour_of,
     decrement,
     first_guess,
@@ -339,6 +340,37 @@ def test_commands_of_one_pump_that_come_late_are_named(ticks: int) -> None:
     else:
         assert abs(late_s) < 4.0 * sigma
         assert not named
+
+
+@pytest.mark.parametrize(
+    ("name", "share"),
+    [("stiffness_scale", 1.0), ("stiffness_scale", 1.2), ("rest_length_m", 1.0), ("rest_length_m", 0.93)],
+)
+def test_what_is_stated_is_held_against_the_logs(name: str, share: float) -> None:
+    truth = values_of(Machine())[name]
+    nominal = replace(Machine(), plant=replace(Machine().plant, **{name: share * truth}))
+    names = ("damping_scale_pumps_connected", "lag_s", "falling_N_per_s", "strength2")
+    problem = Problem(nominal, [track("prbs"), track("chirp", seed=2)], names, {}, stated={name: 0.0})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(nominal)))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    value, sigma = by_logs(found)[name]
+    said = [one.text for one in judge(found, uncertainty(found), colour_of(found), [], []).findings]
+    assert any(" in known, and about " in text for text in said) == (share != 1.0)
+    assert abs(value - truth) < max(5.0 * sigma, 0.2 * abs(share - 1.0) * truth)
+
+
+@pytest.mark.parametrize("swapped", [(), (1,), (0, 1)])
+def test_pumps_that_are_swapped_are_named(swapped: tuple[int, ...]) -> None:
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "falling_N_per_s")
+    tracks = [track("prbs"), track("chirp", seed=2)]
+    for k in swapped:
+        tracks[k] = replace(tracks[k], pwm=tracks[k].pwm[:, ::-1].copy())
+    problem = Problem(Machine(), tracks, names, {})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    said = [one.text for one in judge(found, uncertainty(found), colour_of(found), [], []).findings]
+    named = {text.partition(":")[0] for text in said if "bends away from the pump that pushes" in text}
+    assert named == {tracks[k].name for k in swapped}
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.2])

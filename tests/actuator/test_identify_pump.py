@@ -42,11 +42,12 @@ from calib.stages.actuator.read import read_pump_table
 def test_truth_is_recovered_within_its_deviations(model: str, truth: np.ndarray) -> None:
     fit = fit_pump(pump_records(model, truth), model)
     names = [p.name for p in MODELS[model]]
-    assert "dead_time_s" in fit.sigma
-    for name in fit.sigma:
+    assert "dead_time_s" in fit.fitted
+    for name in fit.fitted:
         expected = truth[names.index(name)]
         assert abs(fit.values[name] - expected) < 4.0 * fit.sigma[name] + 0.02 * expected, name
     assert fit.rms == pytest.approx(0.1, rel=0.1)
+    assert np.allclose(np.diag(fit.correlation), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +67,7 @@ def test_rounding_and_the_order_of_recordings_decide_nothing(model: str, truth: 
 
 def test_what_data_do_not_ask_for_stays_off() -> None:
     fit = fit_pump(pump_records(LAG, LAG_TRUTH), LAG)
-    assert "rising_limit_per_s" not in fit.sigma
+    assert "rising_limit_per_s" not in fit.fitted
     assert fit.fixed["rising_limit_per_s"].startswith("off")
     limited = fit_pump(pump_records(LAG, np.array([0.06, 25.0, 0.3, 20.0])), LAG)
     assert limited.values["rising_limit_per_s"] == pytest.approx(20.0, rel=0.05)

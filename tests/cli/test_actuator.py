@@ -69,8 +69,7 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
         assert abs(section[name] - truth) < 4.0 * section["sigma"][name]
     assert set(yaml.safe_load(rig.read_text())["provenance"]["inputs"]["actuator"]) == {
         *(p.name for p in swings),
-        "camera",
-        "plane",
+        *("known", "camera", "plane", "align"),
     }
     assert (tmp_path / "figures" / "identify_motion.png").exists()
     # The simulation takes the file as it is.
@@ -81,7 +80,8 @@ def test_the_function_returns_both_sections(rig: Path, swings: list[Path]) -> No
     actuator, pump = python.identify(str(swings[0].parent / "swing*.csv"), Rig.load(rig), hold_back=False)
     assert pump is None
     assert abs(actuator.stiffness_scale - 1.0) < 4.0 * actuator.sigma["stiffness_scale"]
-    assert set(actuator.inputs) == {*(path.name for path in swings), "camera", "plane"}
+    sections = {"known", "camera", "plane", "align"}
+    assert set(actuator.inputs) == {*(path.name for path in swings), *sections}
     assert {"motion", "residuals", "parameters"} <= set(python.plots(actuator))
 
 

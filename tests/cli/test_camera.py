@@ -31,7 +31,7 @@ def test_the_shipped_pictures(calib, project_root, tmp_path) -> None:
     assert camera["model"] == "radial2"
     assert camera["fx_px"] == pytest.approx(truth["fx_px"], abs=5 * camera["sigma"]["fx_px"])
     whole = yaml.safe_load(rig.read_text())
-    assert set(whole["provenance"]) == {"version", "inputs"}
+    assert set(whole["provenance"]) == {"version", "inputs", "written"}
     inputs = whole["provenance"]["inputs"]["camera"]
     assert len(inputs) == 18
     assert "board.yaml" in inputs
@@ -238,7 +238,7 @@ def test_a_plane_is_no_better_than_its_camera(calib, folder, rig) -> None:
     rig.write_text(rig.read_text().replace("verdict: ok", "verdict: poor", 1))
     ended = calib("extrinsics", folder, "--rig", rig)
     assert ended.code == 1
-    assert "verdict: poor\n  - The camera's own verdict is poor" in ended.out
+    assert "verdict: poor\n  - camera is poor; what follows from it is no better" in ended.out
     assert yaml.safe_load(rig.read_text())["plane"]["verdict"] == "poor"
 
 
@@ -296,7 +296,8 @@ def test_a_covariance_that_is_none(calib, rig) -> None:
         assert says in ended.sentence
     whole["camera"]["covariance"] = {"order": [], "values": []}
     rig.write_text(yaml.safe_dump(whole))
-    assert calib("distortion", "--rig", rig).code == 0
+    ended = calib("distortion", "--rig", rig)
+    assert ended.code == 1 and "camera in the file was changed" in ended.out
 
 
 def test_the_default_board(calib, tmp_path) -> None:

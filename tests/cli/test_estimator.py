@@ -58,7 +58,8 @@ def test_a_rig_is_aligned(calib: Run, logs: dict[str, Log], rig: Path, tmp_path:
     offset = section.sigma["time_offset_s"]
     assert isinstance(offset, float)
     assert abs(section.time_offset_s - 0.025) < 4.0 * offset
-    assert set(Rig.load(rig).provenance.inputs["align"]) == {"swing.csv", "ellipse.csv", "camera", "plane"}
+    read = {"swing.csv", "ellipse.csv", "camera", "plane", "geometry"}
+    assert set(Rig.load(rig).provenance.inputs["align"]) == read
     assert {path.name for path in figures.iterdir()} == {
         "align_correlation.png", "align_residuals_1.png", "align_residuals_2.png",
     }  # fmt: skip
@@ -252,6 +253,28 @@ def test_the_equations_can_be_checked_on_filterpy(
     assert len(read_states(states)["t_s"]) == 400 and told["rmse"]["mean_q_mm"] < 0.4
     refused = calib("replay", path, "--rig", aligned, "--estimator", "filterpy", "--smooth")
     assert refused.code == 2 and "--estimator filterpy: cannot be smoothed" in refused.err
+
+
+def test_a_log_of_a_moment_is_not_judged(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = log_file("ellipse", change=lambda log: _first(log, 12))
+    ended = calib("replay", path, "--rig", aligned, "-o", tmp_path / "states.csv")
+    assert ended.code == 1 and "the log is too short: innovations are judged from 2 s on" in ended.out
+
+
+def test_states_are_no_better_than_the_alignment(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    rig = Rig.load(aligned)
+    assert rig.align is not None
+    rig.align.doubt(["one swing alone"])
+    rig.save(tmp_path / "poor.yaml")
+    for path, word in ((aligned, "ok"), (tmp_path / "poor.yaml", "poor")):
+        ended = calib("replay", log_file("ellipse"), "--rig", path, "-o", tmp_path / "states.csv", "--json")
+        told = json.loads(ended.out)["replay"]["logs"][0]
+        assert told["verdict"] == word
+        assert ("align is poor; what follows from it is no better" in told["reasons"]) == (word == "poor")
 
 
 def test_several_logs_go_to_a_folder_with_figures(

@@ -11,6 +11,8 @@ import yaml
 
 from calib.stages.firmware.header import VERBATIM
 
+UNTUNED = "no controller yet: gains and feed-forward are those of the nominal actuator"
+
 
 def test_the_header(calib, rig) -> None:
     ended = calib("firmware", "--rig", rig, "-o", rig.parent / "new" / "out")
@@ -18,7 +20,8 @@ def test_the_header(calib, rig) -> None:
     files = [*VERBATIM, "calib_constants.h", "calib_selftest.h", "out.ino"]
     names = sorted(files)
     told = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
-    assert (ended.code, ended.out) == (0, f"147 constants\nverdict: ok\n  (remark) {told}\n")
+    words = f"147 constants\nverdict: poor\n  - {UNTUNED}\n  (remark) {told}\n"
+    assert (ended.code, ended.out) == (1, f"{words}  next: run calib identify and calib control tune\n")
     assert ended.err == f"{', '.join(files)} written to {path.parent}\n"
     assert sorted(p.name for p in path.parent.iterdir()) == names
     text = path.read_text("ascii")
@@ -38,12 +41,12 @@ def test_a_poor_rig_is_written_and_marked(calib, rig, which: str) -> None:
         # The plane belongs to this camera all the same.
         tail = tail[: tail.index("\nprovenance:")] + "\n"
     if which != "camera":
-        tail = tail.replace("verdict: ok", "verdict: poor")
+        tail = tail.replace("verdict: ok", "verdict: poor").split("\n  written:")[0] + "\n"
     rig.write_text(head + tail)
     ended = calib("firmware", "--rig", rig, "-o", rig.parent, "--json")
     assert ended.code == 1
     weak = ["camera", "plane"] if which == "both" else [which]
-    assert json.loads(ended.out)["gate"] == [f"{name} is poor" for name in weak]
+    assert json.loads(ended.out)["gate"] == [*(f"{name} is poor" for name in weak), UNTUNED]
     text = (rig.parent / "calib_constants.h").read_text()
     for name in ("camera", "plane"):
         assert f"#define CALIB_{name.upper()}_OK {int(name not in weak)}" in text
@@ -60,14 +63,16 @@ def test_another_section_that_is_poor(calib, rig) -> None:
 
 
 def test_the_polynomial_of_the_lens_section_is_used(calib, rig) -> None:
-    """That of `calib distortion`, where it is of this camera; of another camera it is fitted anew."""
+    """That of `calib distortion`, where it is of this camera and as written; else it is fitted anew."""
     assert calib("distortion", "--rig", rig).code == 0
     document = yaml.safe_load(rig.read_text())
     document["lens"]["inverse"]["radial"][0] = 0.125
-    for camera, used in ((document["provenance"]["inputs"]["lens"]["camera"], True), ("0" * 64, False)):
+    its, seal = document["provenance"]["inputs"]["lens"]["camera"], document["provenance"].pop("written")
+    for camera, written, used in ((its, {}, True), ("0" * 64, {}, False), (its, seal, False)):
         document["provenance"]["inputs"]["lens"]["camera"] = camera
+        document["provenance"]["written"] = written
         rig.write_text(yaml.safe_dump(document))
-        assert calib("firmware", "--rig", rig, "-o", rig.parent).code == 0
+        assert calib("firmware", "--rig", rig, "-o", rig.parent).code == 1
         text = (rig.parent / "calib_constants.h").read_text()
         assert ("#define CALIB_LENS_INVERSE_C1 0.125f " in text) == used
 

@@ -385,7 +385,57 @@ def test_sections_that_follow_from_an_earlier_one_are_told(tmp_path: Path, proje
     told = rig.outdated()
     for name, verb in (("align", "align"), ("actuator", "identify"), ("lens", "distortion")):
         assert f"{name} in the file is of an earlier plane; run calib {verb} again" in told
-    assert not any(one.startswith(("plane", "imu", "camera")) for one in told)
+    assert not any(one.startswith(("imu", "camera")) for one in told)
+    assert [one for one in told if one.startswith("plane")] == [CHANGED_PLANE]
+
+
+CHANGED_PLANE = (
+    "plane in the file was changed after calib had written it, so that its verdict is of other values; "
+    "run calib extrinsics again"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("camera", "\n  fx_px: 2", "\n  fx_px: 3"),
+        ("lens", "radial: [", "radial: [1"),
+        ("align", "gyro_scale: 0.0", "gyro_scale: 0.2"),
+        ("pump", "verdict: unidentifiable", "verdict: ok"),
+        ("controller", "Kp_pwm_per_rad: 3", "Kp_pwm_per_rad: 3000"),
+    ],
+)
+def test_a_section_that_a_person_changed_is_told_until_its_verb_has_run_again(
+    tmp_path: Path, project_root: Path, name: str, old: str, new: str
+) -> None:
+    path = tmp_path / "rig.yaml"
+    Rig.load(project_root / "tests/goldens/twin_run/rig.yaml").save(path)
+    whole = path.read_text(encoding="utf-8")
+    assert not any("was changed" in one for one in Rig.load(path).outdated())
+    before, after = whole.split(f"\n{name}:", 1)
+    path.write_text(f"{before}\n{name}:{after.replace(old, new, 1)}", encoding="utf-8")
+    Rig.load(path).save(path)
+    rig = Rig.load(path)
+    told = [one for one in rig.outdated() if "was changed" in one]
+    assert [one.split(" in the file")[0] for one in told] == [name]
+    assert told[0] in rig.doubts([name]) and not rig.outdated(["imu"])
+    fresh = type(getattr(rig, name)).model_validate(section_json(getattr(rig, name)))
+    rig.with_sections({name: fresh}).save(path)
+    assert not any("was changed" in one for one in Rig.load(path).outdated())
+
+
+def test_what_follows_from_a_poor_section_is_no_better(project_root: Path) -> None:
+    rig = Rig.load(project_root / "tests/goldens/twin_run/rig.yaml")
+    assert rig.camera is not None and rig.actuator is not None
+    rig.provenance.inputs.clear()
+    assert rig.doubts(["camera", "plane", "view01.png"]) == []
+    rig.camera.doubt(["the board was bent"])
+    assert rig.camera.verdict.word == "poor" and rig.camera.verdict.reasons == ["the board was bent"]
+    assert rig.doubts(["camera", "actuator"])[0] == (
+        "camera is poor, actuator is unidentifiable; what follows from it is no better"
+    )
+    rig.actuator.doubt(["no better"])
+    assert rig.actuator.verdict.word == "unidentifiable"
 
 
 @pytest.mark.parametrize("key", ["fx_px", "t_CW_m"])

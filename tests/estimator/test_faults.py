@@ -14,17 +14,10 @@ from calib.core.arrays import FloatArray
 from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log, Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
-from calib.stages.estimator.driven import Drive, Handover
+from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import FLAGS, OUT
 from calib.stages.estimator.read import READINGS
-from calib.stages.estimator.replay import (
-    consistent,
-    contradicting,
-    estimate,
-    estimator_for,
-    sampled,
-    untimely,
-)
+from calib.stages.estimator.replay import Estimate, consistent, contradicting, sampled, untimely
 
 _LAST_PIXEL = {"u_px": 315.0, "v_px": 207.0}
 _UNIT = {"u_px": 0.5, "v_px": 0.5, "ax_mps2": 1 / 9.81, "ay_mps2": 1 / 9.81, "gz_radps": 57.3}
@@ -75,17 +68,17 @@ def _faulty(log: Log, other: Log) -> Iterator[tuple[str, str, Log]]:
 def _judged(log: Log) -> tuple[str, float]:
     """The verdict's word, and the error against the truth in deviations, root mean square of the worst."""
     setup, tally, watch = setup_for(varied_drive(0)), Tally(0.0126), Watch(READINGS)
-    estimator = estimator_for(setup, Drive(), "auto")
-    out, true = estimate(estimator, rows_from(log), log), truth(log)
+    estimate = Estimate(setup, Drive(), "auto")
+    out, true = estimate(rows_from(log), log), truth(log)
     tally.add(out, true)
     watch.add(log)
     checks = {sensor: check for sensor in SENSORS if (check := tally.check(sensor)) is not None}
     flags = {flag: tally.flags[bit] for flag, bit in FLAGS.items() if tally.flags.get(bit)}
-    assert isinstance(estimator, Handover)
+    assert estimate.sensor is not None
     findings: list[Finding] = [
         *sampled(watch),
         *consistent(checks, flags, len(out)),
-        *contradicting(setup, estimator.sensor, tally.end_s - tally.start_s),
+        *contradicting(setup, estimate.sensor, tally.end_s - tally.start_s),
     ]
     late = out[:, 0] > out[0, 0] + 2.0
     places = [OUT.index(column) for column in ("q1_m", "q2_m", "phi_rad")]

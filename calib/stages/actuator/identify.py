@@ -1665,7 +1665,8 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
     problem = solution.problem
     values = {**values_of(problem.nominal), **problem.held, **solution.values}
     vague = [n for n, why in solution.fixed.items() if n != "lambda3" and NO_CREEP not in why]
-    names = _ordered({*problem.names, *vague})
+    order = list(PARAMETERS)
+    names = tuple(sorted([*problem.names, *vague], key=order.index))
     now = np.zeros((len(names), len(names)))
     at = [names.index(name) for name in problem.names]
     size = np.array([max(abs(values[n]), 0.1 * PARAMETERS[n].scale) for n in problem.names])
@@ -1816,6 +1817,43 @@ def pump_delay(solution: Solution) -> tuple[float, float] | None:
     return next(iter(_one_more(solution, [column]))) if np.isfinite(column).all() and column.any() else None
 
 
+def by_logs(solution: Solution) -> dict[str, tuple[float, float]]:
+    """What logs make of each value that is stated without a deviation, to first order, and the deviation."""
+    problem, values = solution.problem, values_of(solution.problem.nominal)
+    exact = [name for name, sigma in problem.stated.items() if not sigma and name not in problem.names]
+    columns = []
+    for name in exact:
+        step = _STEP * max(abs(values[name]), PARAMETERS[name].scale)
+        up, down = (
+            residuals(replace(problem, held={**problem.held, name: value}), solution.x[None])[0]
+            for value in (values[name] + step, values[name] - step)
+        )
+        columns.append((up - down) / (2.0 * step))
+    of = [name for name, column in zip(exact, columns, strict=True) if column.any()]
+    found = zip(of, _one_more(solution, [one for one in columns if one.any()]), strict=True)
+    return {name: (values[name] + one[0], one[1]) for name, one in found if one is not None}
+
+
+_STATED_OFF = 0.02
+_CROSSED, _BENDS_RAD = -0.5, 0.05
+
+
+def crossed(solution: Solution) -> dict[str, float]:
+    """Correlation of angles with those of the model from which the fit began, by the name of a log.
+
+    Only of logs whose pumps push apart. The fit itself makes pumps weak that bend the rig the other way.
+    """
+    problem, found = solution.problem, {}
+    for k, track in enumerate(problem.tracks):
+        if track.hoses:
+            delay_s, start = float(solution.x[problem.unknowns.delays[k]]), start_of(problem, solution.x, k)
+            head, _ = heads_of(track, [problem.pair(track, {})], [start], delay_s)
+            both = np.stack([head[0][:, 0], track.head[:, 0]])
+            if np.isfinite(both).all() and np.ptp(both, axis=1).min() > _BENDS_RAD:
+                found[track.name] = float(np.corrcoef(both)[0, 1])
+    return found
+
+
 def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
     """The log whose rows come most clearly at another time than those of the others, and a pump that does."""
     raised = known.scale * max(known.inflation.values(), default=1.0)
@@ -1825,6 +1863,25 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
         if abs(late) > max(_MOST_APART_S, _APART_SIGMA * raised * sigma)
     ]
     out = []
+    stated = values_of(solution.problem.nominal)
+    for name, (value, sigma) in by_logs(solution).items():
+        off = abs(value - stated[name])
+        if off > max(_APART_SIGMA * raised * sigma, _STATED_OFF * abs(stated[name])):
+            label, spec = label_of(name), PARAMETERS[name]
+            # Far away the first order says no more than that it is another.
+            about = (
+                f"about {value:.4g} +- {raised * sigma:.2g}" if spec.low <= value <= spec.high else "another"
+            )
+            text = (
+                f"{label} is {stated[name]:.4g} {spec.unit}".rstrip() + f" in known, and {about} by the logs"
+            )
+            advice = "measure it and the mass again, or state its standard deviation under known"
+            out.append(Finding("inconsistent", text, advice))
+    for name, alike in crossed(solution).items():
+        if alike < _CROSSED:
+            text = f"{name}: the head bends away from the pump that pushes, correlation {alike:.2f}"
+            advice = "look whether pwm1 and pwm2, or the hoses, are swapped, or the pictures are mirrored"
+            out.append(Finding("inconsistent", text, advice))
     if far:
         _, name, late = max(far)
         when = "later" if late > 0.0 else "earlier"
@@ -1882,7 +1939,7 @@ def judge(
             out.append(Finding("poor", text))
     if solution.law:
         out.append(Finding("remark", solution.law))
-    if not held:
+    if not held and len(solution.problem.tracks) == 1:
         out.append(Finding("remark", "one log alone: nothing is left to check the parameters on"))
     if next_ones:
         best = next_ones[0]

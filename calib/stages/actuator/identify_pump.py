@@ -302,14 +302,17 @@ class PumpFit:
     Attributes
     ----------
     model : of `MODELS`. theta : all its parameters, in order.
-    sigma : standard deviations by name of those that were estimated.
+    fitted : names of those that were estimated; sigma : their standard deviations.
+    correlation : (n, n) of the fitted ones.
     fixed : sentences by name for those that were not.
     rms : over all samples that were fitted. shape : of the static map.
     """
 
     model: str
     theta: FloatArray
+    fitted: tuple[str, ...]
     sigma: dict[str, float]
+    correlation: FloatArray
     rms: float
     cost: float
     shape: Shape
@@ -467,15 +470,15 @@ def _by_chance(problem: _Problem, theta: FloatArray, free: list[int], extras: in
     return 0.5 * lam * float(chdtri(extras, 1.0 - _CONFIDENCE))
 
 
-def _sigma(problem: _Problem, theta: FloatArray, free: list[int]) -> list[float]:
-    """Standard deviations of the free parameters by the sandwich covariance under the robust loss."""
+def _covariance(problem: _Problem, theta: FloatArray, free: list[int]) -> FloatArray:
+    """Sandwich covariance of the free parameters under the robust loss."""
     base, J = problem.residual(theta), _slopes(problem, theta, free)
     weight = 1.0 / np.sqrt(1.0 + base * base)
     H = (J * weight[:, None]).T @ J
     G = [J[s].T @ (weight[s] * base[s]) for s in _clusters(problem)]
     middle = sum((np.outer(g, g) for g in G), np.zeros_like(H)) * (len(G) / max(len(G) - 1, 1))
     inverse = scaled_inverse(H, 1e-12)
-    return [math.sqrt(max(variance, 0.0)) for variance in np.diag(inverse @ middle @ inverse).tolist()]
+    return np.asarray(inverse @ middle @ inverse)
 
 
 def _check(records: Sequence[PumpRecord]) -> float:
@@ -514,12 +517,16 @@ def fit_pump(
         theta, cost = _solve(problem, start, free)
     else:
         theta, cost, free = _search(problem, nominal, off, fixed)
-    sigma = _sigma(problem, theta, free)
+    covariance = _covariance(problem, theta, free)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(sigma > 0.0, sigma, 1.0)
     residual = problem.residual(theta) * _SCALE_SHARE * span
     return PumpFit(
         model,
         theta,
-        dict(zip([names[k] for k in free], sigma, strict=True)),
+        tuple(names[k] for k in free),
+        {names[k]: float(s) for k, s in zip(free, sigma, strict=True)},
+        covariance / np.outer(safe, safe),
         float(np.sqrt(np.mean(residual**2))),
         cost,
         problem.shape,
@@ -589,8 +596,10 @@ def _search(
 
 def _vague(problem: _Problem, theta: FloatArray, free: list[int], off: FloatArray) -> bool:
     """Whether a parameter that infinity switches off cannot be told from infinity."""
-    sigma = _sigma(problem, theta, free)
-    return any(off[k] == _FREE and not s <= 0.7 * abs(theta[k]) for k, s in zip(free, sigma, strict=True))
+    sigma = np.sqrt(np.maximum(np.diag(_covariance(problem, theta, free)), 0.0))
+    return any(
+        off[k] == _FREE and not s <= 0.7 * abs(theta[k]) for k, s in zip(free, sigma.tolist(), strict=True)
+    )
 
 
 def rms_ahead(fit: PumpFit, record: PumpRecord) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import PoseOptions
@@ -70,7 +70,7 @@ def read_pump_table(
     jumps, and tables that are too short.
     """
     cells, what = read_cells(path), "pressure or force"
-    header, lines = cells.header, np.array(cells.lines)
+    header, rows, lines = cells.header, cells.rows, cells.lines
     at = [cells.column(*one) for one in ((time, _TIME, "time"), (pwm, _PWM, "PWM"), (value, _VALUE, what))]
     table = cells.numbers(*at)
     said = []
@@ -78,12 +78,14 @@ def read_pump_table(
     if not good.all():
         bad = int((~good).sum())
         if bad > max(_MOST_BAD * len(table), 1.0) or bad == len(table):
+            first = lines[int(np.nonzero(~good)[0][0])]
             raise BadInputError(
-                f"{shown(path)}: {bad} of {len(table)} rows have a blank or nan, the first in line "
-                f"{lines[~good][0]}, expected numbers"
+                f"{shown(path)}: {bad} of {len(table)} rows have a blank or nan, the first in line {first}, "
+                f"expected numbers"
             )
         said.append(f"{shown(path)}: {bad} rows with a blank or nan are left out")
-    (t, u, y), lines = table[good].T, lines[good]
+    table, kept = table[good], [k for k in range(len(rows)) if good[k]]
+    t, u, y = table.T
     name = shown(path.name)
     if unit is None:
         unit = "N" if header[at[2]].lower().startswith("force") else "kPa"
@@ -91,18 +93,17 @@ def read_pump_table(
             said.append(f"takes the column {header[at[2]]} for kPa")
     outside = np.nonzero((u < 0.0) | (u > 255.0))[0]
     if len(outside):
-        k = int(outside[0])
-        raise BadInputError(f"{shown(path)}, line {lines[k]}: PWM is {u[k]:g}, expected 0 to 255")
+        line = lines[kept[int(outside[0])]]
+        raise BadInputError(f"{shown(path)}, line {line}: PWM is {u[outside[0]]:g}, expected 0 to 255")
     back = np.nonzero(np.diff(t) < 0.0)[0]
     if len(back):
-        k = int(back[0])
+        line = lines[kept[int(back[0]) + 1]]
         raise BadInputError(
-            f"{shown(path)}, line {lines[k + 1]}: time goes back from {t[k]:g} to {t[k + 1]:g} s"
+            f"{shown(path)}, line {line}: time goes back from {t[back[0]]:g} to {t[back[0] + 1]:g} s"
         )
     if len(t) > 1 and float(np.median(np.diff(t))) >= STATIC_S:
-        rows = [cells.rows[k] for k in np.flatnonzero(good)]
-        return PumpTable(unit, None, _settled(name, header, rows, u, y), tuple(said))
-    return PumpTable(unit, _record(path, name, t, u, y, lines), (), tuple(said))
+        return PumpTable(unit, None, _settled(name, header, [rows[k] for k in kept], u, y), tuple(said))
+    return PumpTable(unit, _record(path, name, t, u, y, [lines[k] for k in kept]), (), tuple(said))
 
 
 def _settled(
@@ -120,10 +121,11 @@ def _settled(
 
 
 def _record(
-    path: Path, name: str, t: FloatArray, u: FloatArray, y: FloatArray, lines: IntArray
+    path: Path, name: str, t: FloatArray, u: FloatArray, y: FloatArray, lines: list[int]
 ) -> PumpRecord:
     new = np.concatenate([[True], np.diff(t) > 0.0])
-    t, u, y, lines = t[new], u[new], y[new], lines[new]
+    t, u, y = t[new], u[new], y[new]
+    kept = [line for line, keep in zip(lines, new.tolist(), strict=True) if keep]
     if len(t) < _FEWEST or t[-1] - t[0] < _SHORTEST_S:
         span = float(t[-1] - t[0]) if len(t) else 0.0
         raise BadInputError(
@@ -135,7 +137,7 @@ def _record(
     if len(far):
         k = int(far[0])
         raise BadInputError(
-            f"{shown(path)}, line {lines[k + 1]}: time jumps from {t[k]:g} to {t[k + 1]:g} s; "
+            f"{shown(path)}, line {kept[k + 1]}: time jumps from {t[k]:g} to {t[k + 1]:g} s; "
             "cut the table there"
         )
     return PumpRecord(name, t, u, y)
@@ -303,8 +305,8 @@ def _from_states(path: Path) -> Head:
     good = np.isfinite(table).all(axis=1) & np.isfinite(spread) & (spread > 0.0) & (table[:, 3] > 0.0)
     # States come at every row of camera and IMU; more than one per tick says the same again.
     table, spread = table[good], spread[good]
-    tick = np.floor((table[:, 0] - table[:1, 0]) / TICK_S)
-    first = np.diff(tick, prepend=-1.0) > 0.0
+    tick = np.floor((table[:, 0] - table[0, 0]) / TICK_S) if len(table) else np.zeros(0)
+    first = np.concatenate([[True], np.diff(tick) > 0.0]) if len(table) else np.zeros(0, dtype=bool)
     table, spread = table[first], spread[first]
     W = np.zeros((len(table), 2, 2))
     W[:, 0, 0], W[:, 1, 1] = 1.0 / table[:, 3], 1.0 / spread

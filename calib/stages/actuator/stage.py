@@ -75,7 +75,7 @@ def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
     from calib.stages.actuator.results import beginning
 
     nominal, stated = beginning(rig)
-    files.hashes |= rig.identities("camera", "plane", "align")
+    files.hashes |= rig.identities("known", "camera", "plane", "align")
     tracks = [
         read_track(files, path, rig, nominal, options, states)
         for path, states in _with_states(files, options)
@@ -464,6 +464,7 @@ def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validate
     from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
 
     logs = _with_states(files, options)
+    files.hashes |= rig.identities("camera", "plane", "align", "actuator", "pump")
     if all(is_arm_log(columns_of(path, options) or ()) for path in files.paths):
         arm = rig.needed("arm", files.rig_path)
         # An arm's trials are read by its own stage.

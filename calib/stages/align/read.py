@@ -92,13 +92,7 @@ def settings_from_rig(
     plane = rig.current_plane(path)
     assert rig.camera is not None
     assert plane is not None
-    x0, y0, x1, y1 = rig.workspace_m
-    view = view_coefficients(
-        rig.camera.optics,
-        np.array(plane.R_CW),
-        np.array(plane.t_CW_m),
-        (0.5 * (x0 + x1), 0.5 * (y0 + y1)),
-    )
+    view = view_coefficients(rig.camera.optics, np.array(plane.R_CW), np.array(plane.t_CW_m), rig.middle_m)
     values = _prior(rig)
     if marker_offset_m is not None:
         values["marker_offset_m"] = (marker_offset_m, 1e-3)

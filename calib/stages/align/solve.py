@@ -787,7 +787,7 @@ class Fit:
     sensor, covariance : (13,) and (13, 13) of `SENSOR`.
     coefficients : of each stretch's spline. noise : that was found.
     good : for each stretch (n,), probability that a picture shows the marker.
-    steps, converged : of Gauss-Newton.
+    loss, steps, converged : of Gauss-Newton.
     """
 
     sensor: FloatArray
@@ -795,6 +795,7 @@ class Fit:
     coefficients: list[FloatArray]
     noise: Noise
     good: list[FloatArray]
+    loss: float
     steps: int
     converged: bool
     arrow: Arrow
@@ -882,7 +883,7 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
             loss = _loss(problem, cs, s, noise)
     covariance = np.asarray(cho_solve(arrow.S, np.eye(len(s))))
     covariance = 0.5 * (covariance + covariance.T)
-    return Fit(s, covariance, cs, noise, goods, steps, converged, arrow)
+    return Fit(s, covariance, cs, noise, goods, loss, steps, converged, arrow)
 
 
 def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArray:

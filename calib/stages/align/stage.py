@@ -46,7 +46,7 @@ def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     from calib.stages.align.read import align_log, settings_from_rig
 
     rig.current_plane(files.rig_path)
-    files.hashes |= rig.identities("camera", "plane")
+    files.hashes |= rig.identities("geometry", "camera", "plane")
     logs: list[AlignLog] = []
     for path in files.paths:
         log, remarks = align_log(read_log(path, options, files.remarks, rig.picture_px))

@@ -95,12 +95,11 @@ def read_trials(
     loads = {n: parse_mass_kg(mass, "--load") for n, mass in _said(options.load or (), "--load", names)}
     days = {name: name.rpartition("_")[0] or name for name in names}
     days |= dict(_said(options.day or (), "--day", names))
-    recordings = []
+    recordings, seen = [], dict[str, str]()
     for path in files.paths:
         recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
-        files.taken(path)
-    seen: dict[str, str] = {}
-    for name, digest in files.hashes.items():
+        name = files.taken(path)
+        digest = files.hashes[name]
         if digest in seen:
             raise BadInputError(
                 f"{name}: is the same recording as {seen[digest]}, expected another trial; leave one out"

@@ -283,11 +283,10 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
 
 
 def _solve_plane(inputs: PlaneInputs) -> Plane:
-    """Fit, judge, and assemble the section; a plane is no better than its camera."""
+    """Fit, judge, and assemble the section."""
     import numpy as np
 
     from calib.core.result import finite_or_none, judged
-    from calib.core.verdict import Finding, Verdict
     from calib.stages.camera.plane import calibrate_plane
     from calib.stages.camera.section import Plane
 
@@ -316,11 +315,6 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
             "difference_max_mm": float(difference.max()),
             "difference_mean_mm": float(difference.mean()),
         }
-    findings = list(fit.verdict.findings)
-    if not inputs.camera.verdict.ok:
-        word = inputs.camera.verdict.word
-        text = f"The camera's own verdict is {word}, and the plane is no better than that."
-        findings.insert(0, Finding("poor", text))
     return Plane(
         R_CW=fit.R_CW.tolist(),
         t_CW_m=fit.t_CW_m.tolist(),
@@ -335,7 +329,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         points=len(fit.corners_m),
         orientation=" ".join(inputs.orientation),
         simulated=inputs.simulated,
-        **judged(Verdict.of(findings)),
+        **judged(fit.verdict),
     ).with_evidence(PlaneEvidence(optics, fit, inputs.left_out))
 
 
@@ -421,9 +415,6 @@ def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     if current is not None:
         sigma_mm = current.sigma_marker_mm.get("calibration_max")
         view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), rig.workspace_m, sigma_mm)
-    if not rig.camera.verdict.ok:
-        word = rig.camera.verdict.word
-        files.narrate(f"the camera's own verdict is {word}; what follows is no better than that")
     return LensInputs(rig.camera, view, options.region_px)
 
 

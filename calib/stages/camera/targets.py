@@ -474,7 +474,8 @@ def name_of(pictures: Sequence[GrayImage]) -> str | None:
     """What most of these pictures show that calib does not read; None where that is nothing known."""
     counts = Counter(grid for gray in pictures if (grid := circle_grid(gray)))
     if not counts:
-        return None
+        mirrored = [np.asarray(cv2.flip(gray, 1), dtype=np.uint8) for gray in pictures]
+        return "a board of markers, mirrored: flip the pictures back" if recognise(mirrored) else None
     (kind, columns, rows), many = counts.most_common(1)[0]
     if many < max(1, len(pictures) // 3):
         return None

@@ -50,6 +50,9 @@ _duration = partial(
 )
 
 
+_LONG_S = 600.0
+
+
 def _wanted(
     files: Files,
     rig: Rig,
@@ -66,6 +69,8 @@ def _wanted(
     machine, model = controlled(rig, limits, None if plant is None else Rig.load(plant))
     wanted = wanted_reference(str(files.paths[0]), model, duration_s, rig, files.rig_path)
     check_workspace(model, wanted, rig.workspace_m)
+    if wanted.duration_s > _LONG_S and duration_s is None:
+        files.narrate(f"{wanted.name}: lasts {wanted.duration_s:.0f} s; t_s is in seconds, not milliseconds")
     return machine, model, wanted
 
 
@@ -140,6 +145,7 @@ def _read_run(files: Files, rig: Rig, options: RunOptions) -> RunInputs:
     machine, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits, options.plant)
     names = options.controllers or controllers_for(wanted, rig.controller)
     files.narrate("simulated: a model of a rig, not the rig")
+    files.hashes |= rig.identities("actuator", "pump", "controller")
     return RunInputs(machine, model, wanted, names, rig.controller, options, files.progress)
 
 
@@ -410,12 +416,13 @@ class TuneOptions:
 
 @dataclass(frozen=True)
 class TuneInputs:
-    """A machine, what controllers know of it, and what is asked of them."""
+    """A machine, what controllers know of it, what is asked of them, and sections that nobody has filled."""
 
     machine: SimulatedRig
     model: Model
     criterion: ControllerCriterion
     progress: Progress
+    nominal: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -443,7 +450,8 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     criterion = ControllerCriterion(gain_margin=gain, phase_margin_rad=phase_rad, sensitivity=peak)
     machine, model = controlled(rig, options.pwm_limits)
     files.hashes |= rig.identities("known", "actuator", "pump")
-    return TuneInputs(machine, model, criterion, files.progress)
+    nominal = [name for name, values in rig.standing.items() if not values]
+    return TuneInputs(machine, model, criterion, files.progress, nominal)
 
 
 def _solve_tune(inputs: TuneInputs) -> Controller:
@@ -496,13 +504,21 @@ def _solve_tune(inputs: TuneInputs) -> Controller:
         falling_N_per_s=finite_or_none(law.falling_N_per_s) if isinstance(law, RateLimit) else None,
         margins=[*_margins("orientation", orientation.points), *_margins("position", position.points)],
         anti_windup=anti_windup,
-        **judged(_judge(anti_windup["clamping"], anti_windup["back_calculation"], model.tick_s)),
+        **judged(_judge(anti_windup["clamping"], anti_windup["back_calculation"], model, inputs.nominal)),
     ).with_evidence(ControllerEvidence(model, orientation, position))
 
 
-def _judge(clamped: AntiWindup, back: AntiWindup, tick_s: float) -> Verdict:
-    """Poor where back-calculation is not worth its name."""
-    findings = []
+def _judge(clamped: AntiWindup, back: AntiWindup, model: Model, nominal: Sequence[str]) -> Verdict:
+    """Poor where back-calculation is not worth its name, or the model is nobody's."""
+    from calib.stages.control.references import built_in
+
+    findings, tick_s = [], model.tick_s
+    if nominal:
+        text = f"rig.yaml tells nothing of {' and '.join(nominal)}, so that gains are for the nominal one"
+        findings.append(Finding("poor", text, "run calib identify, or state what you know under known"))
+    if min(back.rise_s, clamped.rise_s) >= built_in(model, "jump").duration_s:
+        text = "The first step is not reached, so that the anti-windup is not tried: the pumps are too weak "
+        findings.append(Finding("poor", f"{text}for it, or the actuator is of another size."))
     over, limit = back.overshoot_after_jump_rad, clamped.overshoot_after_jump_rad
     if over > max(limit / 3.0, 1e-3):
         text = f"After the jump back-calculation overshoots by {over:.3f} rad, more than a third of "

@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, ComplexArray, FloatArray
 from calib.core.errors import BadInputError
-from calib.core.units import rounded_down
 from calib.stages.actuator.dynamics import linearised, mass_matrix
 from calib.stages.actuator.kinematics import angle, forward
 from calib.stages.control.laws import (
@@ -555,6 +554,12 @@ class Tracking:
     changes_pwm: float
 
 
+def saturation_share(pwm: FloatArray, low: float, high: float) -> tuple[float, float]:
+    """Share of the ticks in which each of two commands (n, 2) is at a limit."""
+    at = ((pwm <= low) | (pwm >= high)).mean(axis=0)
+    return float(at[0]), float(at[1])
+
+
 def settling_s(tick_s: float, error: FloatArray, band: float) -> float | None:
     """Time after which errors (n,) stay within a band for good; None when the last one is outside."""
     outside = np.flatnonzero(np.abs(error) > band)
@@ -591,7 +596,7 @@ def tracking(
     turned = reference.phi_rad - phi
     free = reference.kind == "angle"
     head = forward(q_m, bellows_radius_m)[:, :2] - forward(reference.q_m, bellows_radius_m)[:, :2]
-    nothing, limited = (math.nan, math.nan), ((pwm <= low) | (pwm >= high)).mean(axis=0)
+    nothing = (float("nan"), float("nan"))
     rise = reach = over = settle = jump_over = jump_settle = None
     if free and len(np.unique(reference.phi_rad)) <= 2 and reference.phi_rad[0] != 0.0:
         jump = len(phi) if reference.jump_s is None else round(reference.jump_s / h)
@@ -608,9 +613,9 @@ def tracking(
             jump_settle = settling_s(h, then - end, _BAND * abs(end - wanted))
     return Tracking(
         nothing if free else _pair(error[judged]),
-        math.nan if free else _rms(1e3 * np.linalg.norm(head[judged], axis=1)),
+        float("nan") if free else _rms(1e3 * np.linalg.norm(head[judged], axis=1)),
         _rms(turned[judged]),
-        math.nan if free else float(np.abs(error[judged]).max()),
+        float("nan") if free else float(np.abs(error[judged]).max()),
         float(np.abs(turned[judged]).max()),
         nothing if free else _pair(error),
         rise,
@@ -619,7 +624,7 @@ def tracking(
         settle,
         jump_over,
         jump_settle,
-        (float(limited[0]), float(limited[1])),
+        saturation_share(pwm, low, high),
         float(np.abs(np.diff(pwm, axis=0)).mean()) if len(pwm) > 1 else 0.0,
     )
 
@@ -752,6 +757,14 @@ def _strongest(
     return low
 
 
+def _tuning_rounded(value: float) -> float:
+    """Down to two significant digits: nobody types more, and the margins hold."""
+    if value == 0.0:
+        return 0.0
+    unit = 10.0 ** (math.floor(math.log10(abs(value))) - 1)
+    return float(f"{math.floor(value / unit + 1e-9) * unit:.12g}")
+
+
 def _searched(
     model: Model,
     criterion: ControllerCriterion,
@@ -770,9 +783,8 @@ def _searched(
             unit = Pid(1.0, 0.0 if math.isinf(Ti) else 1.0 / Ti, Td, tick_s=model.tick_s)
             Kp = _strongest(criterion, response(pid_system(unit), omega)[:, 0, 0], seen, omega, most)
             if Kp > 0.0:
-                # Nobody types more digits, and rounded down the margins hold.
-                Kp = rounded_down(Kp, 2)
-                gains = (rounded_down(Kp * unit.Ki, 2), rounded_down(Kp * Td, 2))
+                Kp = _tuning_rounded(Kp)
+                gains = (_tuning_rounded(Kp * unit.Ki), _tuning_rounded(Kp * Td))
                 best.append(Pid(Kp, *gains, tick_s=model.tick_s))
     for pid in sorted(best, key=merit, reverse=True):
         worst = [_worst(loop_margins(series(controllers(pid), rig))) for rig in rigs]

@@ -24,7 +24,7 @@ SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
 """Readings of each sensor at a time."""
 
 _INNOVATIONS = {"camera": ("e_u", "e_v"), "accel": ("e_ax", "e_ay"), "gyro": ("e_gz",)}
-_SETTLED_S = 2.0
+SETTLED_S = 2.0
 
 
 def chi_square_band(degrees: int, draws: int, level: float = 0.95) -> tuple[float, float]:
@@ -33,6 +33,11 @@ def chi_square_band(degrees: int, draws: int, level: float = 0.95) -> tuple[floa
 
     total, tail = degrees * max(draws, 1), 0.5 * (1.0 - level)
     return float(chdtri(total, 1.0 - tail)) / max(draws, 1), float(chdtri(total, tail)) / max(draws, 1)
+
+
+def correlation_band(count: int) -> float:
+    """95 % bound of the correlation of a white sequence with itself one step later."""
+    return 1.96 / math.sqrt(max(count, 1))
 
 
 def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m: float) -> FloatArray:
@@ -61,6 +66,7 @@ class Tally:
     start_s: float = math.nan
     end_s: float = math.nan
     scored: int = 0
+    log_likelihood: float = 0.0
     sensors: dict[str, FloatArray] = field(
         default_factory=lambda: {name: np.zeros(8) for name in (*SENSORS, "last")}
     )
@@ -78,7 +84,8 @@ class Tally:
         flags = out[:, OUT.index("flags")].astype(np.int64)
         for bit in (1, 2, 4, 8, 16, 32, 64):
             self.flags[bit] = self.flags.get(bit, 0) + int(np.count_nonzero(flags & bit))
-        late = out[:, 0] >= self.start_s + _SETTLED_S
+        self.log_likelihood += float(np.nansum(out[:, OUT.index("log_likelihood")]))
+        late = out[:, 0] >= self.start_s + SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])
         if truth is not None:
@@ -152,5 +159,5 @@ class Tally:
             high=high,
             inside=float(sums[3] / count),
             correlation=finite_or_none(max(correlations, key=abs)),
-            correlation_bound=1.96 / math.sqrt(count),
+            correlation_bound=correlation_band(count),
         )

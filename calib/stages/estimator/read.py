@@ -172,8 +172,6 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
     covariance = (
         None if align.covariance is None else _covariance(align.covariance, sigmas, _between_logs(rig))
     )
-    if not align.verdict.ok:
-        said.append(f"the alignment's own verdict is {align.verdict.word}")
     return values, covariance, said
 
 
@@ -315,7 +313,6 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     """
     source = shown(path)
     said: list[str] = []
-    workspace = rig.workspace_m
     view = np.zeros(25)
     if found.camera:
         plane = rig.current_plane(str(path))
@@ -323,8 +320,8 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
             raise BadInputError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
         if plane is None:
             raise BadInputError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
-        middle = (0.5 * (workspace[0] + workspace[2]), 0.5 * (workspace[1] + workspace[3]))
-        view = view_coefficients(rig.camera.optics, np.array(plane.R_CW), np.array(plane.t_CW_m), middle)
+        R, t = np.array(plane.R_CW), np.array(plane.t_CW_m)
+        view = view_coefficients(rig.camera.optics, R, t, rig.middle_m)
     values, covariance, assumed = _from_align(rig)
     said += assumed
     plant = rig.plant

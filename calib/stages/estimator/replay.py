@@ -30,12 +30,12 @@ from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.result import finite_or_none, judged
 from calib.core.rig import Rig
 from calib.core.stage import ProgressCall
-from calib.core.verdict import Finding, Verdict
+from calib.core.verdict import Finding, Severity, Verdict
 from calib.io.columns import Passed
 from calib.io.logs import Log, Watch
 from calib.io.states import STATES, states_writer
 from calib.stages.estimator.baseline import BASELINE, Baseline
-from calib.stages.estimator.consistency import SENSORS, Tally
+from calib.stages.estimator.consistency import SENSORS, SETTLED_S, Tally
 from calib.stages.estimator.driven import (
     Drive,
     DrivenFilter,
@@ -213,7 +213,6 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
     first = next(stream)
     found = periods(first)
     setup, remarks = setup_from_rig(rig, rig_path, found)
-    remarks += rig.outdated("plane", "lens", "lowpass", "orientation_filter", "controller")
     if first.map is not None and first.map.narration:
         remarks.append(first.map.narration)
     stated = rig.estimator is not None or (rig.align is not None and rig.align.jitter_px > 0.0)
@@ -251,19 +250,28 @@ def drive_for(log: OpenLog, rig: Rig, model: str) -> Drive | None:
     return None
 
 
-Estimator = Filter | DrivenFilter | Handover
+class Estimate:
+    """The filter at work on the blocks of a log."""
 
+    def __init__(self, setup: Setup, drive: Drive | None, model: str) -> None:
+        self._kinematic = Filter(setup) if drive is None else None
+        self._driven = (
+            None if drive is None else (DrivenFilter if model == "driven" else Handover)(setup, drive)
+        )
 
-def estimator_for(setup: Setup, drive: Drive | None, model: str) -> Estimator:
-    """The kinematic filter without a drive, else the driven one or, with "auto", both."""
-    if drive is None:
-        return Filter(setup)
-    return DrivenFilter(setup, drive) if model == "driven" else Handover(setup, drive)
+    def __call__(self, rows: Rows, log: Log) -> FloatArray:
+        """Rows of `OUT` for the rows of this block."""
+        if self._kinematic is not None:
+            return self._kinematic.run(rows)
+        assert self._driven is not None
+        return self._driven.run(rows, pwm_of(log))
 
-
-def estimate(estimator: Estimator, rows: Rows, log: Log) -> FloatArray:
-    """Rows of `OUT` for the rows of this block."""
-    return estimator.run(rows) if isinstance(estimator, Filter) else estimator.run(rows, pwm_of(log))
+    @property
+    def sensor(self) -> FloatArray | None:
+        """As `Filter.sensor`; None with the driven model alone, whose plant has a say in it."""
+        if self._kinematic is not None:
+            return self._kinematic.sensor
+        return self._driven.sensor if isinstance(self._driven, Handover) else None
 
 
 # ----------------------------------------------------------------------
@@ -460,7 +468,7 @@ _CALIBRATED = {
 }
 """What a log may tell better than the calibration did, and from which difference on that matters: .2
 degrees, a hundredth of gravity or half of one of the motion, a millisecond."""
-_FLAGGED_SHARE = 0.05
+_FLAGGED_SHARE = _LATE_SHARE = 0.05
 
 
 def sampled(watch: Watch) -> Iterator[Finding]:
@@ -523,8 +531,9 @@ def consistent(checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows
     if flags.get("restarted"):
         text = f"the filter started again {flags['restarted']} times after rejecting all readings"
         yield Finding("remark", text)
-    if flags.get("late"):
-        yield Finding("remark", f"{flags['late']} readings came too late to be used")
+    if late := flags.get("late"):
+        severity: Severity = "poor" if late > _LATE_SHARE * rows else "remark"
+        yield Finding(severity, f"{late} readings came too late to be used")
 
 
 def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterator[Finding]:
@@ -677,7 +686,7 @@ def replay_log(
     kept: list[FloatArray] = []
     compared: dict[str, Errors] = {}
     sensor: FloatArray | None = None
-    findings: list[Finding] = []
+    findings = _unstated(rig)
     with _states_to(output, columns, kept.append if keep else None) as write:
         if estimator == "filterpy":
             stream = _watched(log.stream, sums.watch, _FILTERPY_ROWS, "--estimator filterpy")
@@ -697,10 +706,9 @@ def replay_log(
             write(whole.out[:, _COLUMNS])
         else:
             baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if log.both else None
-            running = estimator_for(log.setup, drive, model)
-            _stream(log, running, baseline, fused, sums, write, progress)
-            # With the driven model alone its plant has a say in it.
-            sensor = None if isinstance(running, DrivenFilter) else running.sensor
+            estimate = Estimate(log.setup, drive, model)
+            _stream(log, estimate, baseline, fused, sums, write, progress)
+            sensor = estimate.sensor
             if fused and sums.baseline.scored:
                 compared["baseline"] = _lengths_and_angle(sums.baseline)
             elif not fused and sums.fused.scored:
@@ -708,7 +716,27 @@ def replay_log(
     states = np.concatenate(kept) if kept else None
     trace = sums.trace.values if sums.trace is not None else np.zeros((0, 0))
     name = estimator if not smoothed else "smoothed"
-    return _replayed(log, name, sums, compared, sensor, findings).with_evidence(Held(trace, columns, states))
+    result = _replayed(log, name, sums, compared, sensor, findings)
+    result.doubt(rig.doubts(_taken(log, drive is not None)))
+    return result.with_evidence(Held(trace, columns, states))
+
+
+def _unstated(rig: Rig) -> list[Finding]:
+    """A remark on the radius, which no log tells."""
+    if "bellows_radius_m" in rig.standing["actuator"]:
+        return []
+    text = (
+        f"nobody has stated the bellows' radius: with {1e3 * rig.plant.bellows_radius_m:g} mm for it, each "
+        "millimetre that it is off moves q1 and q2 by half a millimetre at 30 degrees"
+    )
+    return [Finding("remark", text, "measure it, and state it as known: {actuator: {bellows_radius_m: ...}}")]
+
+
+def _taken(log: OpenLog, driven: bool) -> list[str]:
+    """Sections that states of this log follow from."""
+    optics = ["camera", "plane"] if log.periods.camera else []
+    inertial = ["imu", "align"] if log.periods.imu else []
+    return [*optics, *inertial, *(["actuator", "pump"] if driven else []), "estimator"]
 
 
 @contextmanager
@@ -725,7 +753,7 @@ def _states_to(
 
 def _stream(
     log: OpenLog,
-    running: Estimator,
+    estimate: Callable[[Rows, Log], FloatArray],
     baseline: Baseline | None,
     fused: bool,
     sums: Sums,
@@ -750,7 +778,7 @@ def _stream(
     with behind(finish) as hand:
         for block in ahead(log.stream):
             rows = rows_of(block, log.periods.ticks)
-            hand((block, rows, estimate(running, rows, block)))
+            hand((block, rows, estimate(rows, block)))
             done += len(block)
             if progress is not None:
                 progress(min(done * 80, size), size)
@@ -778,6 +806,9 @@ def _replayed(
         if repeats and all(one.severity != "inconsistent" for one in seen):
             findings += untimely(log.setup, rows_of(log.first, log.periods.ticks))
         findings += consistent(checks, flags, max(tally.rows, 1))
+        if not tally.end_s - tally.start_s >= SETTLED_S:
+            text = f"the log is too short: innovations are judged from {SETTLED_S:g} s on"
+            findings.append(Finding("poor", text))
         if sensor is not None:
             findings += contradicting(log.setup, sensor, tally.end_s - tally.start_s)
     if share is not None and share < 0.99:

@@ -64,6 +64,7 @@ def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
     elif files.output is not None:
         check_writable(files.output, STATES_FILE)
     if options.tune:
+        files.hashes |= rig.identities("camera", "plane", "imu", "align")
         for path in files.paths:
             files.taken(path)
     return ReplayInputs(files, rig, options, outputs)

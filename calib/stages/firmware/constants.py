@@ -94,9 +94,6 @@ class Lookup:
 
 _HORIZON_SHARE = 0.1
 
-MIDDLE_M = (0.0, 0.08)
-"""Place about which an alignment's stretch magnifies, as in `calib.stages.estimator.sensors`."""
-
 
 @dataclass(frozen=True)
 class PlaneConstants:
@@ -128,7 +125,7 @@ def _depths(A: FloatArray, world: FloatArray) -> FloatArray:
 def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     """The plane's homographies for a marker in the workspace, without the shift and stretch of an alignment.
 
-    The calibrated plane shows P at P + shift + stretch (P - `MIDDLE_M`). None for a rig without a plane.
+    The calibrated plane shows P at P + shift + stretch (P - `Rig.middle_m`). None for a rig without a plane.
 
     Raises `BadInputError` for a workspace behind the camera.
     """
@@ -137,8 +134,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     if known is None or rig.camera is None:
         return None
     camera, R, t = rig.camera.optics, np.array(known.R_CW), np.array(known.t_CW_m)
-    x0, y0, x1, y1 = rig.workspace_m
-    grid = box_grid((x0, y0, x1, y1), 9, 7).reshape(-1, 2)
+    grid = box_grid(rig.workspace_m, 9, 7).reshape(-1, 2)
     # The denominator is the reciprocal depth when A's depth is in metres.
     A_inverse = np.array(known.A_inverse)
     A = np.asarray(np.linalg.inv(A_inverse), dtype=np.float64)
@@ -153,7 +149,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     raw, raw_least, error = None, 0.0, 0.0
     if inside.sum() >= 12:
         H = fit_homography(grid[inside], pixels[inside]).H
-        centre = np.array([[0.5 * (x0 + x1), 0.5 * (y0 + y1)]])
+        centre = np.array([rig.middle_m])
         H = H * (float((centre @ R[2, :2] + t[2])[0]) / _depths(H, centre)[0])
         raw = np.asarray(np.linalg.inv(H))
         raw_least = _HORIZON_SHARE / float(_depths(H, grid).max())
@@ -162,7 +158,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     right = np.eye(3)
     if rig.align is not None:
         shrink, (across, along) = 1.0 / (1.0 + rig.align.plane_stretch), rig.align.plane_shift_m
-        x, y = MIDDLE_M
+        x, y = rig.middle_m
         right[:2] = [[shrink, 0.0, x - shrink * (x + across)], [0.0, shrink, y - shrink * (y + along)]]
     return PlaneConstants(
         right @ ideal,

@@ -23,12 +23,14 @@ import numpy as np
 from calib.core import __version__
 from calib.core.errors import BadInputError
 from calib.core.result import identity
+from calib.core.rig import KINDS
 from calib.core.verdict import Finding, Verdict
 from calib.core.writing import Kind, begins, make_folder, write_atomically
 from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
 from calib.stages.camera.section import InverseLens
 from calib.stages.firmware.constants import Lookup, constants, plane_constants
+from calib.stages.firmware.section import Envelope
 from calib.stages.firmware.vectors import selftest_rows
 
 if TYPE_CHECKING:
@@ -190,11 +192,12 @@ def verbatim(name: str) -> str:
 
 
 def _inverse(rig: Rig) -> InverseLens | None:
-    """The polynomial of the section lens where that is of this camera, else a new one."""
+    """The polynomial of the section lens where that is unchanged and of this camera, else a new one."""
     if rig.camera is None:
         return None
-    if rig.lens is not None and rig.inputs.get("lens", {}).get("camera") == identity(rig.camera):
-        return rig.lens.inverse
+    lens, known = rig.lens, rig.inputs.get("lens", {})
+    if lens is not None and not lens.changed and known.get("camera") == identity(rig.camera):
+        return lens.inverse
     return fit_inverse(rig.camera.optics)
 
 
@@ -203,20 +206,38 @@ def _undone(inverse: InverseLens) -> bool:
     return error is not None and error <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
 
 
-def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
-    """As bad as the worst of the sections that the constants come from, and as the lens is undone."""
+_WIDE = 4.0
+"""Times the default from which on a limit of the envelope is remarked on."""
+
+
+def _of_envelope(stated: Envelope, allowed: Mapping[str, Any], rest_m: float) -> list[Finding]:
+    """Findings on an envelope that a person states: it stops a rig that rests, or hardly any."""
+    least, greatest = allowed["least_length_m"], allowed["greatest_length_m"]
+    if not least < rest_m < greatest:
+        text = f"the envelope, {least:g} to {greatest:g} m, does not hold the rest length, {rest_m:g} m"
+        return [Finding("poor", f"{text}: the guard stops the pumps of a rig that rests")]
+    default = Envelope()
+    names = ("rate_mps", "full_power_s", "open_loop_s", "apart_m")
+    wide = [name for name in names if getattr(stated, name) > _WIDE * getattr(default, name)]
+    wide += ["greatest_length_m"] if greatest > _WIDE * rest_m else []
+    text = f"the envelope allows much more than by default, so that the guard acts late: {', '.join(wide)}"
+    return [Finding("remark", text)] if wide else []
+
+
+def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
+    """Findings on the sections that the constants come from, and on how the lens is undone."""
     findings = []
-    for name in FLASHED:
+    # With an alignment the header takes nothing from a log at rest.
+    taken = [name for name in FLASHED if name != "imu" or whole.align is None]
+    for name in taken:
         section = getattr(whole, name)
-        # With an alignment the header takes nothing from a log at rest.
-        if section is None or (name == "imu" and whole.align is not None):
-            continue
-        word = section.verdict.word
-        if word != "ok":
+        if section is not None and not section.verdict.ok:
             advice = _UNREAD if name in ("camera", "plane") else ""
+            word = section.verdict.word
             findings.append(Finding(word, f"{name.replace('_', ' ')} is {word}", advice))
-    # A lens of another camera is not taken, but undone anew.
-    findings += [Finding("poor", sentence) for sentence in whole.outdated("lens")]
+    # A lens of another camera, or one that was changed, is not taken but undone anew.
+    stale = whole.outdated([*(name for name in taken if name != "lens"), "actuator", "pump"])
+    findings += [Finding("poor", sentence) for sentence in stale]
     if inverse is not None and not _undone(inverse):
         error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
         text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
@@ -225,6 +246,9 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
         lacks, verb = ("camera", "intrinsics") if whole.camera is None else ("plane", "extrinsics")
         text = f"no {lacks} yet: the sketch records, and controls nothing"
         findings.append(Finding("remark", text, f"run calib {verb}"))
+    elif whole.controller is None:
+        text = "no controller yet: gains and feed-forward are those of the nominal actuator"
+        findings.append(Finding("poor", text, "run calib identify and calib control tune"))
     if whole.align is not None and whole.align.time_offset_s < 0.0:
         early_ms = -1e3 * whole.align.time_offset_s
         text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"
@@ -232,7 +256,7 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> Verdict:
     if whole.simulated:
         text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
         findings.append(Finding("remark", text))
-    return Verdict.of(findings)
+    return findings
 
 
 def header_of(rig: Rig, source: str) -> Header:
@@ -260,9 +284,12 @@ def header_of(rig: Rig, source: str) -> Header:
         for section, names in rig.inputs.items()
         for name, digest in names.items()
         # Sections that name others as inputs; only files are inputs of the header.
-        if name not in ("camera", "plane") and (section != "plane" or plane is not None)
+        if name not in KINDS and (section != "plane" or plane is not None)
     }
-    verdict = _judge(rig, inverse)
+    findings = _judge(rig, inverse)
+    if rig.envelope is not None:
+        findings += _of_envelope(rig.envelope, context["envelope"], context["rest_length_m"])
+    verdict = Verdict.of(findings)
     text = rendered(
         "calib_constants.h.j2",
         camera=camera,

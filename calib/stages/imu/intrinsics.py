@@ -654,7 +654,7 @@ def foreign_axes(turns: Turns, accel: Accelerometer, found: Gyroscope, si: bool)
         itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)
     ):
         P = np.diag(signs) @ np.eye(3)[list(order)]
-        for scale in _scales(rates, si, _COARSE):
+        for scale in _scales(rates, si, _COARSE if not si else _FINE):
             now = _rms(turns, accel, rates, P / scale, across)
             if now < least:
                 best, least = P, now

@@ -461,9 +461,16 @@ def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold
 
 def sampled(s: Sampling) -> dict[str, Any]:
     """Keys that say how a log was sampled."""
-    names = ("duration_s", "rate_hz", "jitter_s", "missing", "repeated_rows", "repeated_stamps")
-    splits = sum(gap.split for gap in s.gaps)
-    return {name: getattr(s, name) for name in names} | {"gaps": len(s.gaps) - splits, "splits": splits}
+    return {
+        "duration_s": s.duration_s,
+        "rate_hz": s.rate_hz,
+        "jitter_s": s.jitter_s,
+        "missing": s.missing,
+        "gaps": sum(not gap.split for gap in s.gaps),
+        "splits": sum(gap.split for gap in s.gaps),
+        "repeated_rows": s.repeated_rows,
+        "repeated_stamps": s.repeated_stamps,
+    }
 
 
 def sensor_findings(logs: Sequence[Any]) -> Iterator[Finding]:

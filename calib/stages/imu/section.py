@@ -53,7 +53,7 @@ class ImuLog(Section):
     splits: Count = quantity(label="splits")
     repeated_rows: Count = quantity(label="repeated rows")
     repeated_stamps: Count = quantity(label="repeated stamps")
-    moves_s: list[Pair] = []
+    moves_s: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = []
     gyro_degps: Number | None = quantity(None, label="drift by -gz", digits=4)
     gyro_sigma_degps: NotNegative | None = quantity(None, label="sigma", digits=4)
     onchip_degps: Number | None = quantity(None, label="by the chip", digits=4)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from calib.stages.imu.intrinsics import IntrinsicsInputs
     from calib.stages.imu.mahony import AngleFilter
     from calib.stages.imu.sampling import Readings
-    from calib.stages.imu.section import Drift, Imu
+    from calib.stages.imu.section import Drift, Imu, OrientationFilter
     from calib.stages.imu.tuning import TuneInputs, TuneLog
 
 
@@ -61,6 +61,14 @@ def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
     return [files.output]
 
 
+def _static_words(imu: Imu) -> list[Block]:
+    del imu
+    return [
+        Line("± is one standard deviation, < a 95 % bound where the logs are too short for an estimate"),
+        Line("accel mean holds gravity: one pose does not tell it from a bias"),
+    ]
+
+
 static = Stage(
     "imu static",
     "IMU at rest",
@@ -75,10 +83,7 @@ static = Stage(
     metavar="LOG...",
     writes=("imu",),
     output=Output("Kalibr's imu.yaml to write as well.", _write_kalibr, ("--imu-yaml",), kind=_imu_yaml),
-    words=lambda imu: [
-        Line("± is one standard deviation, < a 95 % bound where the logs are too short for an estimate"),
-        Line("accel mean holds gravity: one pose does not tell it from a bias"),
-    ],
+    words=_static_words,
     plots=later("calib.stages.imu.plots", "static_plots"),
 )
 
@@ -187,6 +192,14 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     return TuneInputs(logs, *sensor_noise(rig, logs), how.tilted)
 
 
+def _tune_words(section: OrientationFilter) -> list[Block]:
+    del section
+    return [
+        Line("noise: variance of the angle over that of the accelerometer's; peak: angle per rate's bias"),
+        Line("each part of the logs is judged with gains of the others"),
+    ]
+
+
 tune = Stage(
     "imu tune",
     "Angle filter",
@@ -202,10 +215,7 @@ tune = Stage(
     metavar="LOG...",
     writes=("orientation_filter",),
     uses=("imu", "imu_intrinsics", "camera", "plane"),
-    words=lambda section: [
-        Line("noise: variance of the angle over that of the accelerometer's; peak: angle per rate's bias"),
-        Line("each part of the logs is judged with gains of the others"),
-    ],
+    words=_tune_words,
     plots=later("calib.stages.imu.plots", "tune_plots"),
 )
 

@@ -988,36 +988,42 @@ def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> f
     return float(_LATE_S[k]) if clear and k not in (0, len(rests) - 1) else 0.0
 
 
-def _contradiction(piece: Piece, own: Smoothed | None, sensor: Noise) -> tuple[str, Severity] | None:
-    """In what the readings of a piece do not speak of the same motion.
+def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
+    """Findings on logs whose rate, accelerometer and reference do not speak of the same motion.
 
     A rate that errs is "poor" alone, for a sensor that lies flat errs as one with wrong columns does.
     """
-    seen, own = piece.reference_rad, own if piece.in_plane else None
-    if seen is not None:
-        if what := _against(piece.t_s, piece.rate_radps, seen):
-            return f"rate and reference contradict each other: {what}", "inconsistent"
-        if own is not None and (what := _slowly(piece.t_s, own.phi_rad, seen)):
-            return f"accelerometer and reference contradict each other: {what}", "inconsistent"
-    if own is None:
-        return None
-    late = _late(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
-    if abs(late) > _MOST_LATE_S:
-        when = f"{1e3 * abs(late):.0f} ms {'later' if late > 0.0 else 'earlier'}"
-        return f"the accelerometer's angle comes {when} than the rate's", "inconsistent"
-    if own.gyro_noise > max(_TIMES_THE_SENSOR * sensor.gyro, _MOST_RATE_ERROR):
-        text = f"the rate errs by {math.degrees(own.gyro_noise):.2g} deg/s/sqrt(Hz), the sensor by "
-        text = f"rate and accelerometer contradict each other: {text}{math.degrees(sensor.gyro):.2g}"
-        return text, "poor"
-    return None
+    out: dict[str, Finding] = {}
 
+    def found(source: str, what: str, severity: Severity = "inconsistent") -> None:
+        text = f"{source}: {what}"
+        out.setdefault(source, Finding(severity, text, "check the columns, signs and units of that log"))
 
-def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
-    """Findings on logs that contradict themselves, or whose sensor is mounted otherwise; one for each."""
-    out: dict[str, tuple[str, Severity]] = {}
     for piece, own in zip(pieces, result.smoothed, strict=True):
-        if piece.source not in out and (found := _contradiction(piece, own, result.noise)):
-            out[piece.source] = found
+        if piece.reference_rad is not None:
+            what = _against(piece.t_s, piece.rate_radps, piece.reference_rad)
+            if what:
+                found(piece.source, f"rate and reference contradict each other: {what}")
+            elif piece.in_plane and own is not None:
+                what = _slowly(piece.t_s, own.phi_rad, piece.reference_rad)
+                if what:
+                    found(piece.source, f"accelerometer and reference contradict each other: {what}")
+        if piece.in_plane and own is not None:
+            late = _late(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
+            if abs(late) > _MOST_LATE_S:
+                when = "later" if late > 0.0 else "earlier"
+                found(
+                    piece.source,
+                    f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's",
+                )
+            elif own.gyro_noise > max(_TIMES_THE_SENSOR * result.noise.gyro, _MOST_RATE_ERROR):
+                found(
+                    piece.source,
+                    "rate and accelerometer contradict each other: the rate errs by "
+                    f"{math.degrees(own.gyro_noise):.2g} deg/s/sqrt(Hz), the sensor by "
+                    f"{math.degrees(result.noise.gyro):.2g}",
+                    "poor",
+                )
     offsets = [
         (piece.source, offset)
         for piece, offset in zip(pieces, result.offset_rad, strict=True)
@@ -1027,13 +1033,12 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
     for source, offset in offsets:
         apart = float(wrapped(np.array(offset - middle)))
         if abs(apart) > _MOST_TURNED_RAD:
-            text = (
+            found(
+                source,
                 f"the angle of its accelerometer differs from the reference by {math.degrees(apart):.3g} deg "
+                "more than that of the other logs, as if the sensor were mounted otherwise",
             )
-            text += "more than that of the other logs, as if the sensor were mounted otherwise"
-            out.setdefault(source, (text, "inconsistent"))
-    advice = "check the columns, signs and units of that log"
-    return [Finding(severity, f"{source}: {text}", advice) for source, (text, severity) in out.items()]
+    return list(out.values())
 
 
 # ----------------------------------------------------------------------

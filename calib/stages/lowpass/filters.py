@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from calib.core.arrays import ComplexArray, FloatArray
 from calib.core.errors import BadInputError
-from calib.core.units import rounded_down
 
 # ----------------------------------------------------------------------
 # Samples with time stamps as the firmware sees them: one value per tick.
@@ -64,7 +63,12 @@ class Ticks:
 
 
 def on_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
-    """The samples (n, d), taken at times (n,) that do not run backwards, one per tick."""
+    """The samples (n, d), taken at times (n,) that do not run backwards, one per tick.
+
+    Raises `BadInputError` for no samples.
+    """
+    if len(t_s) == 0:
+        raise BadInputError("has no samples")
     breaks = np.nonzero(np.diff(t_s) > max(LONGEST_HOLD_S, 2.0 / rate_hz))[0] + 1
     pieces, held, dropped = [], 0, 0
     for first, last in zip([0, *breaks.tolist()], [*breaks.tolist(), len(t_s)], strict=True):
@@ -354,14 +358,20 @@ def cutoff_hz(sections: FloatArray, rate_hz: float) -> float:
     return float(brentq(above_half, 0.0, 0.5 * rate_hz, xtol=1e-15 * rate_hz, rtol=1e-12))
 
 
+def settled_state(sections: FloatArray, first: FloatArray) -> FloatArray:
+    """State (k, 2, ...) after `first` (...) has been the input for ever."""
+    state = np.stack([1.0 - sections[:, 0], sections[:, 2] - sections[:, 5]], axis=1)
+    return np.asarray(state.reshape(*state.shape, *([1] * np.ndim(first))) * first)
+
+
 def filter_signal(sections: FloatArray, x: FloatArray) -> FloatArray:
     """Filtered signal (n, ...) along the first axis, started without a transient; `x` has no NaN."""
     from scipy.signal import sosfilt
 
-    # As after the first value has been the input for ever.
-    state = np.stack([1.0 - sections[:, 0], sections[:, 2] - sections[:, 5]], axis=1)
-    zi = state.reshape(*state.shape, *([1] * (x.ndim - 1))) * x[0]
-    return np.asarray(sosfilt(sections, x, axis=0, zi=zi)[0], dtype=np.float64)
+    if len(x) == 0:
+        return np.array(x, dtype=np.float64)
+    y, _ = sosfilt(sections, x, axis=0, zi=settled_state(sections, np.asarray(x[0])))
+    return np.asarray(y, dtype=np.float64)
 
 
 def step_response(sections: FloatArray, rate_hz: float) -> StepResponse:
@@ -719,10 +729,15 @@ def _candidate(spectra: Sequence[Spectrum], wanted: float, order: int, family: s
                 low = middle
     else:
         low = high
-    filter_ = at(rounded_down(low, 3))
+    filter_ = at(_three_digits_below(low))
     delay_s = dc_delay_s(filter_.sections, rate)
     lost = max(motion_lost(one, filter_.sections, delay_s) for one in spectra)
     return Candidate(filter_, delay_s, _worst(spectra, filter_), lost)
+
+
+def _three_digits_below(value: float) -> float:
+    power = math.floor(math.log10(value)) - 2
+    return float(f"{math.floor(value / 10.0**power * (1 + 1e-12))}e{power}")
 
 
 def _amount(value: float, unit: str) -> str:

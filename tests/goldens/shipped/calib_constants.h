@@ -70,10 +70,10 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x34E43B39UL
+#define CALIB_ID 0x476027CFUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
-#define CALIB_RIG_OK 1 /* 0: a section that they come from is not ok */
+#define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
 #define CALIB_SIMULATED 1 /* 1: they come from a simulated rig or rendered pictures */
 
 /* Camera (2.5) and lens (B.1), for programs of your own; the pipeline reads SKEW, CX, CY and P1, P2 of them. */

@@ -9,7 +9,7 @@
 
 #include "calib_pipeline.h"
 
-#if CALIB_ID != 0x34E43B39UL
+#if CALIB_ID != 0x476027CFUL
 #error "calib: calib_selftest.h is of another rig than calib_constants.h"
 #endif
 #if CALIB_UNDISTORT != 1

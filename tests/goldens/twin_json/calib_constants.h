@@ -2,7 +2,6 @@
  * calib_constants.h - constants of one rig, written by calib <version>. Do not edit.
  *
  * SHA-256 of the values: <hash>
- * input actuator/align: <hash>
  * input actuator/steps.csv: <hash>
  * input actuator/swing.csv: <hash>
  * input align/ellipse.csv: <hash>
@@ -26,16 +25,12 @@
  * input camera/view15.png: <hash>
  * input camera/view16.png: <hash>
  * input camera/view17.png: <hash>
- * input controller/actuator: <hash>
- * input controller/pump: <hash>
  * input imu/static.csv: <hash>
  * input imu_intrinsics/poses.csv: <hash>
  * input orientation_filter/ellipse.csv: <hash>
- * input orientation_filter/imu: <hash>
  * input orientation_filter/swing.csv: <hash>
  * input plane/board.yaml: <hash>
  * input plane/plane01.png: <hash>
- * input pump/align: <hash>
  * input pump/steps.csv: <hash>
  * input pump/swing.csv: <hash>
  * camera: radial2, verdict ok
@@ -81,7 +76,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x1673B71DUL
+#define CALIB_ID 0xA2F9BEE1UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -125,9 +120,9 @@
 #define CALIB_PLANE_INVERSE_11 0.00365914684f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_12 -8.84317196e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_13 -0.599137306f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93017171e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362197496f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160736144f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93016588e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362197473f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160735458f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -139,9 +134,9 @@
 #define CALIB_PLANE_NORMALISED_11 1.00044012f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_12 -0.0241067167f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_13 -0.0202301797f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216817278f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216817111f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.987359703f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.22097373f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220974401f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
@@ -155,9 +150,9 @@
 #define CALIB_PLANE_RAW_11 0.00369113241f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_12 -8.82065069e-05f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_13 -0.604404747f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.2181283e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363215478f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160437569f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.2181203e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363215455f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160436869f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
@@ -238,10 +233,10 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.50559652f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000252841361f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.8640303e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000252841332f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.86402984e-06f /* row 1, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_1 -4.03702461e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.76469074e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_21 -5.76469029e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000257198408f /* row 2, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_2 -1.73832395e-05f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00250488776f /* K_a, share of the accelerometer's residual */
@@ -252,12 +247,12 @@
 #define CALIB_FUSED_ALONE_PHI_PER_M 5.30199051f /* the same without the IMU, rad/m */
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.603981f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00251949113f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.187963128f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.0068645007f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00904239714f /* K_r, dimensionless */
+#define CALIB_FUSED_MOVING_LENGTH 0.187963143f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00686450116f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00904239807f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000369595218f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000369595189f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */

@@ -2,7 +2,6 @@
  * calib_constants.h - constants of one rig, written by calib <version>. Do not edit.
  *
  * SHA-256 of the values: <hash>
- * input actuator/align: <hash>
  * input actuator/chirp.csv: <hash>
  * input actuator/swing.csv: <hash>
  * input align/ellipse.csv: <hash>
@@ -26,16 +25,12 @@
  * input camera/view15.png: <hash>
  * input camera/view16.png: <hash>
  * input camera/view17.png: <hash>
- * input controller/actuator: <hash>
- * input controller/pump: <hash>
  * input imu/static.csv: <hash>
  * input imu_intrinsics/poses.csv: <hash>
  * input orientation_filter/ellipse.csv: <hash>
- * input orientation_filter/imu: <hash>
  * input orientation_filter/swing.csv: <hash>
  * input plane/board.yaml: <hash>
  * input plane/plane01.png: <hash>
- * input pump/align: <hash>
  * input pump/chirp.csv: <hash>
  * input pump/swing.csv: <hash>
  * camera: radial2, verdict ok
@@ -81,7 +76,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x4820B85DUL
+#define CALIB_ID 0xD6170CEEUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
@@ -125,9 +120,9 @@
 #define CALIB_PLANE_INVERSE_11 0.00365915406f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_12 -8.84328838e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_13 -0.599134326f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93019353e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362198264f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160737112f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93018771e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362198241f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160736367f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -139,9 +134,9 @@
 #define CALIB_PLANE_NORMALISED_11 1.00044215f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_12 -0.0241070334f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_13 -0.0202261657f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216817856f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987361848f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220973596f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216817688f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987361789f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220974311f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
@@ -155,9 +150,9 @@
 #define CALIB_PLANE_RAW_11 0.0036911394f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_12 -8.82079403e-05f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_13 -0.604401708f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21815013e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363216246f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160438538f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21814213e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363216223f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160437793f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
@@ -238,26 +233,26 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.48945248f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000251091988f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.82162193e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000251091958f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.82162147e-06f /* row 1, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_1 -3.83900806e-06f /* row 1, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_21 -5.72522458e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000255319697f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.72727705e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_22 0.000255319668f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.72727687e-05f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00248736376f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.00025355391f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_WEAK 0.000253553881f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00819377787f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.92134604e-05f /* bias times the same, rad */
 #define CALIB_FUSED_PHI_PER_M 0.376656383f /* K_c / lever, rad/m */
 #define CALIB_FUSED_ALONE_PHI_PER_M 5.29867506f /* the same without the IMU, rad/m */
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.5973501f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00252549001f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.188893035f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00691254344f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00911073852f /* K_r, dimensionless */
+#define CALIB_FUSED_MOVING_LENGTH 0.18889305f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.0069125439f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00911073945f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000366810185f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000366810127f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
