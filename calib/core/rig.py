@@ -208,10 +208,9 @@ class Rig:
                 setattr(rig, name, validated(kind_of(name), values, source, where))
         # What is a section's identity may change with the version.
         if rig.provenance.version == __version__:
-            for name, digest in rig.provenance.written.items():
-                one = getattr(rig, name, None)
-                if isinstance(one, Result):
-                    one.sealed(digest)
+            for name, one in rig.sections.items():
+                if isinstance(one, Result) and name in rig.provenance.written:
+                    one.sealed(rig.provenance.written[name])
         if schema == 1 and ("actuator" in sections or "pump" in sections):
             from calib.stages.actuator.section import parted
 

@@ -162,6 +162,10 @@ def _defaults(bag: Path, topics: Sequence[Topic]) -> TopicMap:
         if columns:
             found[topic.name] = _fields(columns)
     if not found:
+        from calib.io.states import HEAD, STATES_TOPIC
+
+        if {STATES_TOPIC, HEAD} <= {topic.name for topic in topics}:
+            raise BadInputError(f"{source}: holds states that calib replay has written, expected a log")
         raise BadInputError(
             f"{source}: has no topic that is known by itself, found {_listed(topics)}; {hint}"
         )

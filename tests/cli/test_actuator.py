@@ -173,6 +173,14 @@ def test_a_pump_and_both_its_models(calib: Run, tables: list[Path], tmp_path: Pa
     assert section["lag_s"] == pytest.approx(0.5, rel=0.03)
     assert section["identified"]["better"] == "linear lag"
     assert (tmp_path / "f" / "pump_runs.png").exists()
+    # Tables of two folders may have one name.
+    alike = [tmp_path / place / "runs.csv" for place in ("a", "b")]
+    for table, path in zip(tables, alike, strict=False):
+        path.parent.mkdir()
+        path.write_bytes(table.read_bytes())
+    document = json.loads(calib("identify", "pump", *alike, "--rig", rig, "--json").out)
+    models = document["pump"]["identified"]["models"].values()
+    assert all(set(one["held_by_file"]) == {"runs.csv", "runs.csv (2)"} for one in models)
     document = json.loads(calib("identify", "pump", *tables[:1], "--rig", rig, "--json").out)
     assert document["verb"] == "identify pump"
 

@@ -11,7 +11,10 @@ import yaml
 
 from calib.stages.firmware.header import VERBATIM
 
-UNTUNED = "no controller yet: gains and feed-forward are those of the nominal actuator"
+UNTUNED = (
+    "no controller yet: gains and feed-forward are those of the nominal actuator, and compile for a board "
+    "only with CALIB_I_KNOW"
+)
 
 
 def test_the_header(calib, rig) -> None:
@@ -20,12 +23,13 @@ def test_the_header(calib, rig) -> None:
     files = [*VERBATIM, "calib_constants.h", "calib_selftest.h", "out.ino"]
     names = sorted(files)
     told = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
-    words = f"147 constants\nverdict: poor\n  - {UNTUNED}\n  (remark) {told}\n"
-    assert (ended.code, ended.out) == (1, f"{words}  next: run calib identify and calib control tune\n")
+    words = f"147 constants\nverdict: ok\n  (remark) {UNTUNED}\n  (remark) {told}\n"
+    assert (ended.code, ended.out) == (0, f"{words}  next: run calib identify and calib control tune\n")
     assert ended.err == f"{', '.join(files)} written to {path.parent}\n"
     assert sorted(p.name for p in path.parent.iterdir()) == names
     text = path.read_text("ascii")
     assert "#define CALIB_CAMERA_OK 1" in text
+    assert "#define CALIB_RIG_OK 0" in text
     assert str(rig.parent) not in text
     assert "input plane/board.yaml: " in text
     if compiler := shutil.which("cc"):
@@ -46,7 +50,7 @@ def test_a_poor_rig_is_written_and_marked(calib, rig, which: str) -> None:
     ended = calib("firmware", "--rig", rig, "-o", rig.parent, "--json")
     assert ended.code == 1
     weak = ["camera", "plane"] if which == "both" else [which]
-    assert json.loads(ended.out)["gate"] == [*(f"{name} is poor" for name in weak), UNTUNED]
+    assert json.loads(ended.out)["gate"] == [f"{name} is poor" for name in weak]
     text = (rig.parent / "calib_constants.h").read_text()
     for name in ("camera", "plane"):
         assert f"#define CALIB_{name.upper()}_OK {int(name not in weak)}" in text
@@ -72,7 +76,7 @@ def test_the_polynomial_of_the_lens_section_is_used(calib, rig) -> None:
         document["provenance"]["inputs"]["lens"]["camera"] = camera
         document["provenance"]["written"] = written
         rig.write_text(yaml.safe_dump(document))
-        assert calib("firmware", "--rig", rig, "-o", rig.parent).code == 1
+        assert calib("firmware", "--rig", rig, "-o", rig.parent).code == 0
         text = (rig.parent / "calib_constants.h").read_text()
         assert ("#define CALIB_LENS_INVERSE_C1 0.125f " in text) == used
 

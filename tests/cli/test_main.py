@@ -157,7 +157,7 @@ def test_stdout_that_is_full(environment, rig) -> None:
 def test_streams_that_are_closed_harm_nothing(environment, rig, closed: str) -> None:
     before = rig.read_bytes()
     done = _sh(environment, f"calib firmware --rig rig.yaml -o out {closed}", rig.parent)
-    assert done.returncode == 1
+    assert done.returncode == 0
     assert (rig.parent / "out" / "calib_constants.h").read_text().startswith("/*\n * calib_constants.h")
     assert rig.read_bytes() == before
 

@@ -298,6 +298,8 @@ def test_mcap_holds_states_and_poses(tmp_path: Path) -> None:
 
     values = _rows()
     path = _written(tmp_path / "states.mcap", values)
+    with pytest.raises(BadInputError, match="holds states that calib replay has written, expected a log"):
+        read_log(path)
     read, poses = [], []
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)

@@ -229,10 +229,13 @@ def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
     from calib.stages.actuator.read import read_pump_table
 
     columns = (options.time, options.pwm, options.value, options.unit)
-    tables = [read_pump_table(path, *columns) for path in files.paths]
-    kept_out = [read_pump_table(path, *columns) for path in expanded(options.held)]
+    tables = []
     for path in files.paths:
-        files.taken(path)
+        table, name = read_pump_table(path, *columns), files.taken(path)
+        # Tables of two folders may have one name.
+        record = None if table.record is None else replace(table.record, name=name)
+        tables.append(replace(table, record=record))
+    kept_out = [read_pump_table(path, *columns) for path in expanded(options.held)]
     return PumpInputs(tables, kept_out, rig, files.progress)
 
 

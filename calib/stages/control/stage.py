@@ -514,7 +514,8 @@ def _judge(clamped: AntiWindup, back: AntiWindup, model: Model, nominal: Sequenc
 
     findings, tick_s = [], model.tick_s
     if nominal:
-        text = f"rig.yaml tells nothing of {' and '.join(nominal)}, so that gains are for the nominal one"
+        parts = " and ".join(f"the {name}" for name in nominal)
+        text = f"rig.yaml tells nothing of {parts}, so that gains are for the nominal one"
         findings.append(Finding("poor", text, "run calib identify, or state what you know under known"))
     if min(back.rise_s, clamped.rise_s) >= built_in(model, "jump").duration_s:
         text = "The first step is not reached, so that the anti-windup is not tried: the pumps are too weak "

@@ -103,6 +103,10 @@ FLASHED = ("camera", "plane", "imu", "orientation_filter", "lowpass", "align", "
 """Sections whose verdicts say whether the header can be flashed."""
 _UNREAD = "see CALIB_CAMERA_OK and CALIB_PLANE_OK, do not flash it unread"
 
+_UNTUNED = (
+    "no controller yet: gains and feed-forward are those of the nominal actuator, and compile for a board "
+    "only with CALIB_I_KNOW"
+)
 _INVERSE_PX = 0.1
 _INVERSE_SHARE = 0.9
 """A header is marked when its polynomial undoes the lens worse than this, or in less of the picture."""
@@ -247,8 +251,7 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
         text = f"no {lacks} yet: the sketch records, and controls nothing"
         findings.append(Finding("remark", text, f"run calib {verb}"))
     elif whole.controller is None:
-        text = "no controller yet: gains and feed-forward are those of the nominal actuator"
-        findings.append(Finding("poor", text, "run calib identify and calib control tune"))
+        findings.append(Finding("remark", _UNTUNED, "run calib identify and calib control tune"))
     if whole.align is not None and whole.align.time_offset_s < 0.0:
         early_ms = -1e3 * whole.align.time_offset_s
         text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"
@@ -295,7 +298,7 @@ def header_of(rig: Rig, source: str) -> Header:
         camera=camera,
         inverse=inverse,
         plane=plane,
-        rig_ok=verdict.ok,
+        rig_ok=verdict.ok and (plane is None or rig.controller is not None),
         simulated=rig.simulated,
         inputs=dict(sorted(inputs.items())),
         **context,

@@ -79,7 +79,7 @@
 #define CALIB_ID 0xD6170CEEUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
-#define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok */
+#define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
 #define CALIB_SIMULATED 1 /* 1: they come from a simulated rig or rendered pictures */
 
 /* Camera (2.5) and lens (B.1), for programs of your own; the pipeline reads SKEW, CX, CY and P1, P2 of them. */
