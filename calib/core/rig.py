@@ -25,7 +25,7 @@ from pydantic import BaseModel, Field, field_validator
 
 from calib.core import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import one_line, quoted, read_yaml_mapping, shown
+from calib.core.files import one_line, quoted, read_yaml_mapping, sha256, shown
 from calib.core.result import Result, Section, identity, section_json
 from calib.core.schema import nearest, validated
 from calib.core.writing import Kind, head, write_atomically
@@ -403,14 +403,17 @@ class Rig:
     def identities(self, *names: str) -> dict[str, str]:
         """SHA-256 of these sections to note what was computed from them; empty for one that there is not."""
         found = {name: getattr(self, name) for name in names}
-        return {name: "" if section is None else identity(section) for name, section in found.items()}
+        own = {name: _said if name in _STATED else identity for name in names}
+        return {name: "" if section is None else own[name](section) for name, section in found.items()}
 
     def outdated(self, names: Iterable[str] | None = None) -> list[str]:
         """Sentences for sections of these, or of all, that do not say what their verb would say now.
 
         They were computed from others than the rig has now, or were changed after the verb wrote them.
         """
-        there = {name: getattr(self, name) for name in (VERBS if names is None else names) if name in VERBS}
+        asked = set(VERBS if names is None else names)
+        # In the order of the file, in which verbs follow from each other.
+        there = {name: getattr(self, name) for name in KINDS if name in asked and name in VERBS}
         there = {name: one for name, one in there.items() if isinstance(one, Result)}
         known = {name: self.inputs.get(name, {}) for name in there}
         now = self.identities(*(name for name in KINDS if any(name in inputs for inputs in known.values())))
@@ -418,10 +421,10 @@ class Rig:
         for name, inputs in known.items():
             what, again = name.replace("_", " "), f"run calib {VERBS[name]} again"
             changed = [
-                # One that is not here may only not have been handed over.
+                # A result that is not here may only not have been handed over.
                 other.replace("_", " ")
                 for other in now
-                if now[other] and inputs.get(other, now[other]) != now[other]
+                if (now[other] or other in _STATED) and inputs.get(other, now[other]) != now[other]
             ]
             earlier = [other for other in changed if other not in _STATED]
             if earlier:
@@ -430,8 +433,7 @@ class Rig:
                 sentences.append(f"{what} in the file is older than {' and '.join(changed)}; {again}")
             if there[name].changed:
                 sentences.append(
-                    f"{what} in the file was changed after calib had written it, so that its verdict is of "
-                    f"other values; {again}"
+                    f"{what} in the file {CHANGED}, so that its verdict is of other values; {again}"
                 )
         return sentences
 
@@ -447,7 +449,21 @@ class Rig:
         return [*no_better, *self.outdated(sections)]
 
 
+def _said(section: BaseModel) -> str:
+    """SHA-256 of what a person states beyond the defaults; empty for nothing."""
+
+    def pruned(values: Any) -> Any:
+        if not isinstance(values, dict):
+            return values
+        kept = {key: pruned(value) for key, value in values.items()}
+        return {key: value for key, value in kept.items() if value is not None and value != {}}
+
+    values = pruned(section.model_dump(mode="json", exclude_defaults=True))
+    return sha256(json.dumps(values, sort_keys=True).encode()) if values else ""
+
+
 _MOST_OFF_PX = 0.01
+CHANGED = "was changed after calib had written it"
 _STATED = ("known", "geometry")
 """What a person states."""
 VERBS = {

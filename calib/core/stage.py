@@ -68,6 +68,7 @@ class Files:
     hashes : SHA-256 of what was read, by name, for the provenance.
     remarks : sentences on what was read, which are narrated once all of it is.
     written : names of the files that the outcome was written to beside rig.yaml.
+    merged : sections whose earlier values go into the outcome as they are.
     failed : by the path of a file that could not be worked on, the exit code that it alone would have.
     """
 
@@ -79,6 +80,7 @@ class Files:
     hashes: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
+    merged: tuple[str, ...] = ()
     failed: dict[Path, int] = field(default_factory=dict)
     figures: bool = True
     keep: bool = True
@@ -198,6 +200,8 @@ class Stage:
         """
         from pydantic import ValidationError
 
+        from calib.core.rig import CHANGED
+
         for name in self.needs:
             rig.needed(name, files.rig_path)
         inputs = self.read(files, rig, options)
@@ -216,8 +220,11 @@ class Stage:
                 f"{names}: no useful answer follows{told}{which if len(files.paths) > 1 else ''}"
             ) from error
         results, doubts = self.results(outcome), rig.doubts(files.hashes)
+        doubts += [one for one in rig.outdated(files.merged) if CHANGED in one]
         for result in results:
             result.made_by(self.name, files.hashes).doubt(doubts)
+        for section in self.sections(outcome).values():
+            section.sealed()
         for sentence in () if results else doubts:
             files.narrate(sentence)
         return outcome

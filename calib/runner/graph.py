@@ -329,7 +329,9 @@ class Runner:
             before = (self.out / "rig.yaml").read_text(encoding="utf-8", errors="replace")
         except OSError:
             return False
-        return "inputs:" in before and not any(one in before for one in self._digests.values())
+        return "inputs:" in before and not any(
+            digest in before for path, digest in self._digests.items() if path.suffix != ".yaml"
+        )
 
     def rig(self) -> Rig:
         """All that is known: what the person told and what the stages have learnt."""

@@ -424,6 +424,22 @@ def test_a_section_that_a_person_changed_is_told_until_its_verb_has_run_again(
     assert not any("was changed" in one for one in Rig.load(path).outdated())
 
 
+def test_what_a_person_states_later_is_told(project_root: Path) -> None:
+    """Stated, changed and taken back; but nothing, or the defaults, state nothing."""
+    rig = Rig.load(project_root / "tests/goldens/twin_run/rig.yaml")
+    rig.provenance.inputs = {"align": {"geometry": ""}, "actuator": {"known": ""}}
+    for nothing in ({}, {"marker_offset_m": 0.015}):
+        rig.geometry = validated(kind_of("geometry"), nothing, "rig.yaml", "geometry")
+        rig.known = validated(kind_of("known"), {"actuator": {}} if nothing else {}, "rig.yaml", "known")
+        assert rig.outdated() == []
+    rig.geometry = validated(kind_of("geometry"), {"marker_offset_m": 0.016}, "rig.yaml", "geometry")
+    assert rig.outdated() == ["align in the file is older than geometry; run calib align again"]
+    rig.provenance.inputs["align"] = rig.identities("geometry")
+    assert rig.outdated() == []
+    rig.geometry = None
+    assert rig.outdated() == ["align in the file is older than geometry; run calib align again"]
+
+
 def test_what_follows_from_a_poor_section_is_no_better(project_root: Path) -> None:
     rig = Rig.load(project_root / "tests/goldens/twin_run/rig.yaml")
     assert rig.camera is not None and rig.actuator is not None

@@ -236,6 +236,7 @@ def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
         record = None if table.record is None else replace(table.record, name=name)
         tables.append(replace(table, record=record))
     kept_out = [read_pump_table(path, *columns) for path in expanded(options.held)]
+    files.merged = ("pump",)
     return PumpInputs(tables, kept_out, rig, files.progress)
 
 
@@ -362,6 +363,7 @@ def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> Spring
     elongation_m, force_N = read_displacements(path)
     # The section keeps what logs have told of the other parameters.
     files.hashes |= rig.provenance.inputs.get("actuator", {})
+    files.merged = ("actuator",)
     files.taken(path)
     return Springs(shown(path), elongation_m, force_N, options.per, rig)
 

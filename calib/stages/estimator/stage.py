@@ -102,6 +102,7 @@ def _solve(inputs: ReplayInputs) -> list[Replayed]:
 
         with files.progress("tuning") as progress:
             tuned = tuned_section(files.paths, rig, files.rig_path, progress, options)
+        tuned.made_by("replay", files.hashes)
         rig = rig.with_sections({"estimator": tuned})
     results = []
     for path, output in zip(files.paths, inputs.outputs, strict=True):
