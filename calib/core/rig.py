@@ -392,7 +392,7 @@ class Rig:
                 f"{shown(source)}: plane was calibrated with another camera than the one in camera; "
                 "run calib extrinsics again"
             )
-        off_px = self.plane.off_px(self.camera, (self.geometry or Geometry()).workspace_m)
+        off_px = self.plane.off_px(self.camera, self.workspace_m)
         if not off_px < _MOST_OFF_PX:
             raise BadInputError(
                 f"{shown(source)}: plane.A_px_per_m is {off_px:.3g} px off from what camera, R_CW and t_CW_m "
@@ -413,8 +413,7 @@ class Rig:
         """
         asked = set(VERBS if names is None else names)
         # In the order of the file, in which verbs follow from each other.
-        there = {name: getattr(self, name) for name in KINDS if name in asked and name in VERBS}
-        there = {name: one for name, one in there.items() if isinstance(one, Result)}
+        there = [name for name in KINDS if name in asked and isinstance(getattr(self, name), Result)]
         known = {name: self.inputs.get(name, {}) for name in there}
         now = self.identities(*(name for name in KINDS if any(name in inputs for inputs in known.values())))
         sentences = []
@@ -431,11 +430,17 @@ class Rig:
                 sentences.append(f"{what} in the file is of an earlier {' and '.join(earlier)}; {again}")
             elif changed:
                 sentences.append(f"{what} in the file is older than {' and '.join(changed)}; {again}")
-            if there[name].changed:
-                sentences.append(
-                    f"{what} in the file {CHANGED}, so that its verdict is of other values; {again}"
-                )
+            sentences += self.retyped([name])
         return sentences
+
+    def retyped(self, names: Iterable[str]) -> list[str]:
+        """Sentences for sections of these that were changed after their verb wrote them."""
+        return [
+            f"{name.replace('_', ' ')} in the file was changed after calib had written it, so that its "
+            f"verdict is of other values; run calib {VERBS[name]} again"
+            for name in names
+            if isinstance(one := getattr(self, name), Result) and one.changed
+        ]
 
     def doubts(self, names: Iterable[str]) -> list[str]:
         """Sentences for sections of these that nothing computed from them can be better than."""
@@ -463,7 +468,6 @@ def _said(section: BaseModel) -> str:
 
 
 _MOST_OFF_PX = 0.01
-CHANGED = "was changed after calib had written it"
 _STATED = ("known", "geometry")
 """What a person states."""
 VERBS = {

@@ -200,8 +200,6 @@ class Stage:
         """
         from pydantic import ValidationError
 
-        from calib.core.rig import CHANGED
-
         for name in self.needs:
             rig.needed(name, files.rig_path)
         inputs = self.read(files, rig, options)
@@ -219,8 +217,7 @@ class Stage:
             raise BadInputError(
                 f"{names}: no useful answer follows{told}{which if len(files.paths) > 1 else ''}"
             ) from error
-        results, doubts = self.results(outcome), rig.doubts(files.hashes)
-        doubts += [one for one in rig.outdated(files.merged) if CHANGED in one]
+        results, doubts = self.results(outcome), [*rig.doubts(files.hashes), *rig.retyped(files.merged)]
         for result in results:
             result.made_by(self.name, files.hashes).doubt(doubts)
         for section in self.sections(outcome).values():

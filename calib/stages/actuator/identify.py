@@ -1821,16 +1821,16 @@ def by_logs(solution: Solution) -> dict[str, tuple[float, float]]:
     """What logs make of each value that is stated without a deviation, to first order, and the deviation."""
     problem, values = solution.problem, values_of(solution.problem.nominal)
     exact = [name for name, sigma in problem.stated.items() if not sigma and name not in problem.names]
-    columns = []
+    columns: dict[str, FloatArray] = {}
     for name in exact:
         step = _STEP * max(abs(values[name]), PARAMETERS[name].scale)
         up, down = (
             residuals(replace(problem, held={**problem.held, name: value}), solution.x[None])[0]
             for value in (values[name] + step, values[name] - step)
         )
-        columns.append((up - down) / (2.0 * step))
-    of = [name for name, column in zip(exact, columns, strict=True) if column.any()]
-    found = zip(of, _one_more(solution, [one for one in columns if one.any()]), strict=True)
+        if np.any(up != down):
+            columns[name] = (up - down) / (2.0 * step)
+    found = zip(columns, _one_more(solution, columns.values()), strict=True)
     return {name: (values[name] + one[0], one[1]) for name, one in found if one is not None}
 
 

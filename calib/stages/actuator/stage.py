@@ -469,14 +469,15 @@ def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validate
     from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
 
     logs = _with_states(files, options)
-    files.hashes |= rig.identities("camera", "plane", "align", "actuator", "pump")
     if all(is_arm_log(columns_of(path, options) or ()) for path in files.paths):
         arm = rig.needed("arm", files.rig_path)
+        files.hashes |= rig.identities("arm")
         # An arm's trials are read by its own stage.
         from calib.stages.arm.stage import Options, held_trials
 
         arm_options = Options(columns=options.columns, load=options.load, day=options.day)
         return ValidateInputs((), held_trials(files, arm, arm_options), rig)
+    files.hashes |= rig.identities("camera", "plane", "align", "actuator", "pump")
     tracks = [begun_track(files, path, rig, options, states) for path, states in logs]
     if IMPROVED not in models_of(rig):
         files.remarks.append(

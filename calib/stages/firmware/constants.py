@@ -129,7 +129,6 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
 
     Raises `BadInputError` for a workspace behind the camera.
     """
-
     known = rig.current_plane(source)
     if known is None or rig.camera is None:
         return None

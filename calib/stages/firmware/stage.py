@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import option
 from calib.core.stage import Files, Output, Stage
@@ -47,8 +46,7 @@ def _read(files: Files, rig: Rig, options: FirmwareOptions) -> FirmwareInputs:
     from calib.stages.firmware.check import read_frames
 
     log = Path(options.check)
-    if rig.plane is None:
-        raise BadInputError(f"{source}: has no plane yet, so no board can run it; run calib extrinsics first")
+    rig.needed("plane", files.rig_path, ", so no board can run it")
     return FirmwareInputs(rig, source, read_frames(log), shown(log))
 
 

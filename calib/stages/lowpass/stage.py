@@ -249,7 +249,6 @@ def solve(inputs: Inputs) -> LowPass:
 
 
 def _log_section(made: Filter, positions: Positions) -> LowPassLog:
-
     from calib.stages.lowpass import filters
     from calib.stages.lowpass.section import LowPassAxis, LowPassLog
 
