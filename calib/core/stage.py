@@ -207,11 +207,17 @@ class Stage:
             files.narrate(sentence)
         try:
             outcome = self.solve(inputs)
-        except ValidationError as error:
-            # A fit to nonsense can end anywhere.
-            first = error.errors()[0]
-            key, value = ".".join(str(part) for part in first["loc"]), first["input"]
-            told = f", {key} came out as {value:.6g}" if isinstance(value, int | float) else ""
+        except ValueError as error:
+            # A fit to nonsense can end anywhere: with values that no section holds, or in a singular matrix.
+            from numpy.linalg import LinAlgError
+
+            if not isinstance(error, ValidationError | LinAlgError):
+                raise
+            told = ""
+            if isinstance(error, ValidationError):
+                first = error.errors()[0]
+                key, value = ".".join(str(part) for part in first["loc"]), first["input"]
+                told = f", {key} came out as {value:.6g}" if isinstance(value, int | float) else ""
             names = ", ".join(shown(path) for path in files.paths)
             which = "; one of them may be of another rig or spoilt: leave them out in turn"
             raise BadInputError(

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
+from calib.stages.camera.model import Board
+
 SIZE = ("--image-size", "640x480")
 RADIAL2 = ("--model", "radial2")
 
@@ -405,3 +407,19 @@ def test_the_noise_of_an_imu_there_and_back(calib, rig, tmp_path) -> None:
     assert yaml.safe_load(again.read_text()) == yaml.safe_load(IMU)
     assert calib("export", "kalibr-imu", "--rig", rig, "--name", "x: 1\ny").code == 2
     assert json.loads(calib("import", "kalibr-imu", again, "--rig", rig, "--json").out)["imu"] == section
+
+
+def test_points_of_nothing_have_no_answer(calib, tmp_path) -> None:
+    """Drawn at random, as no camera sees a board; a matrix on the way to their camera holds no numbers."""
+    rng = np.random.default_rng(0)
+    target = Board(4, 3, 0.02).points_m()
+    rows = ["view,x_m,y_m,u_px,v_px"]
+    for name in "abcde":
+        pixels = rng.uniform(1.0, 230.0, (len(target), 2))
+        rows += [f"{name},{x},{y},{u},{v}" for (x, y), (u, v) in zip(target, pixels, strict=True)]
+    points, rig = tmp_path / "points.csv", tmp_path / "rig.yaml"
+    points.write_text("\n".join(rows) + "\n")
+    words = (points, "--image-size", "320x240", "--model", "pinhole", "--keep-all", "--rig", rig)
+    ended = calib("intrinsics", *words)
+    assert ended.code == 3 and ended.sentence == f"{points}: no useful answer follows"
+    assert not rig.exists()
