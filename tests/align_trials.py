@@ -32,7 +32,7 @@ PRIOR = {**USUAL_PRIOR, "shift_x_m": (0.0, 5e-5), "shift_y_m": (0.0, 5e-5)}
 
 @dataclass(frozen=True)
 class Trial:
-    """A rig, what is true of its sensors (13,), and the view that was calibrated (24,)."""
+    """A rig, what is true of its sensors (14,), and the view that was calibrated (24,)."""
 
     rig: SimulatedRig
     truth: FloatArray
@@ -50,6 +50,7 @@ def known(rig: SimulatedRig, plane_error: tuple[float, float, float] = (0.0, 0.0
             "mount_angle_rad": imu.mount_angle_rad,
             "gyro_scale": imu.gyro_scale[2],
             "imu_lever_m": imu.lever_m[1],
+            "imu_across_m": imu.lever_m[0],
             "marker_offset_m": tracker.marker_offset_m,
             "time_offset_s": tracker.latency_s,
             "shift_x_m": dx,
@@ -89,6 +90,8 @@ def draw(seed: int) -> Trial:
     )
     rig = replace(SimulatedRig(), imu=imu, tracker=tracker)
     shift = rng.normal(0.0, 5e-5, 2).tolist()
+    across = float(np.random.default_rng(7000 + seed).normal(0.0, 0.004))
+    rig = replace(rig, imu=replace(imu, lever_m=(across, imu.lever_m[1])))
     return known(rig, (shift[0], shift[1], float(rng.normal(0.0, 1e-3))))
 
 

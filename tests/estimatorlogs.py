@@ -32,6 +32,7 @@ SIGMA = {
     "mount_angle_rad": 3e-4,
     "gyro_scale": 1e-3,
     "imu_lever_m": 3e-4,
+    "imu_across_m": 2e-4,
     "marker_offset_m": 3e-5,
     "time_offset_s": 5e-4,
     "shift_x_m": 1e-5,
@@ -54,6 +55,7 @@ def varied(seed: int) -> SimulatedRig:
     imu = replace(
         rig.imu,
         mount_angle_rad=float(rng.uniform(-0.05, 0.05)),
+        lever_m=(float(np.random.default_rng(2000 + seed).uniform(-4e-3, 4e-3)), rig.imu.lever_m[1]),
         gyro_bias_radps=tuple(rng.normal(0.0, 0.006, 3).tolist()),
         accel_bias_mps2=tuple(rng.normal(0.0, 0.05, 3).tolist()),
         gyro_scale=tuple(rng.normal(0.0, 0.005, 3).tolist()),
@@ -101,6 +103,7 @@ def truth_of_sensors(rig: SimulatedRig) -> FloatArray:
             "mount_angle_rad": imu.mount_angle_rad,
             "gyro_scale": imu.gyro_scale[2],
             "imu_lever_m": imu.lever_m[1],
+            "imu_across_m": imu.lever_m[0],
             "marker_offset_m": tracker.marker_offset_m,
             "time_offset_s": tracker.latency_s,
             "accel_scale_x": imu.accel_scale[0],

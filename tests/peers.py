@@ -81,7 +81,7 @@ def unscented(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tu
                 if kind == CAMERA:
                     camera_terms(setup.view, setup.noise, setup.noise[6] ** 2, state, none, H, out)
                     return out[:2].copy()
-                imu_terms(setup.noise, state, none, H, out)
+                imu_terms(setup.noise, setup.noise[7] ** 2, state, none, H, out)
                 return out[:3].copy()
 
             held = list(CONSIDERED)

@@ -182,7 +182,11 @@ def _imported(from_: str, source: Path, data: bytes) -> tuple[str, Any, tuple[st
             "it comes without biases and error bars, so its verdict is poor until calib imu static has run"
         )
         return "imu", imu, (f"IMU noise at {imu.rate_hz:g} Hz", lacks)
-    camera = {"ros": from_ros, "opencv": from_opencv, "kalibr": from_kalibr}[from_](as_text(source, data))
+    text = as_text(source, data)
+    camera = {"ros": from_ros, "opencv": from_opencv, "kalibr": from_kalibr}[from_](text)
+    others = re.findall(r"^cam[1-9]\d*(?=:)", text, re.MULTILINE) if from_ == "kalibr" else []
+    left = (f"cam0 is taken, {' and '.join(others)} left out",) if others else ()
     width, height = camera.image_size_px
     lacks = "it comes without error bars, so its verdict is poor until calib intrinsics has seen pictures"
-    return "camera", imported_camera(camera, from_), (f"camera {camera.model}, {width}x{height} px", lacks)
+    words = (f"camera {camera.model}, {width}x{height} px", *left, lacks)
+    return "camera", imported_camera(camera, from_), words

@@ -35,7 +35,7 @@ def convert(
     import numpy as np
 
     from calib.io.columns import COLUMNS_FILE, Passed
-    from calib.io.logs import LOG, beside, iter_log, refuse_counts
+    from calib.io.logs import LOG, beside, iter_log, refuse_counts, within
     from calib.io.states import states_writer
 
     if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
@@ -53,14 +53,17 @@ def convert(
     if read_as is not None and read_as.narration:
         narrate(read_as.narration)
     names = tuple(first.columns)
-    rows, passed = 0, Passed()
+    rows, passed, beyond, before, back = 0, Passed(), Passed(), -np.inf, list[str]()
     with (
         states_writer(output, ("t_s", *names), LOG) as add,
         progress_bar(f"converting {log.name}") as progress,
     ):
         for block in chain([first], stream):
             add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
-            rows, passed = rows + len(block), passed + block.passed
+            rows, passed, beyond = rows + len(block), passed + block.passed, beyond + within(block).passed
+            for k in np.flatnonzero(np.diff(block.t_s, prepend=before) < 0.0).tolist():
+                back.append(f"line {block.lines[k]}: the time goes back to {block.t_s[k]:g} s")
+            before = block.t_s[-1]
             progress(rows, 0)
     if save_columns is not None and read_as is not None:
         write_atomically(save_columns, read_as.text(), COLUMNS_FILE)
@@ -78,3 +81,10 @@ def convert(
         narrate(f"left out: {', '.join(first.unknown)}")
     for sentence in passed.sentences:
         narrate(sentence)
+    if beyond.beyond:
+        many = f"{beyond.beyond} cells hold more than any sensor gives ({beyond.first})"
+        narrate(f"{many}; they are written, and other verbs pass them over")
+    if back:
+        narrate(
+            f"{back[0]}{f', as in {len(back) - 1} more lines' * (len(back) > 1)}; other verbs refuse that"
+        )

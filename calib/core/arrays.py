@@ -1,4 +1,4 @@
-"""Names for the array types that signatures use, and two ways to cut an array."""
+"""Names for the array types that signatures use, how an array is cut, and its integral."""
 
 from __future__ import annotations
 
@@ -24,3 +24,13 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
 def blocks(values: FloatArray, size: int) -> FloatArray:
     """Values (n, ...) in whole blocks (n // size, size, ...); what is left at the end is left out."""
     return values[: len(values) // size * size].reshape(-1, size, *values.shape[1:])
+
+
+def integral(t: FloatArray, values: FloatArray) -> FloatArray:
+    """Integral (n,) of values (n,) at t (n,) from the first of them on, by trapezoids.
+
+    Of a rate that a sensor gives at t it is the angle at t; where a value holds for the step before it, as in
+    (2.3c), the angle is half a step ahead.
+    """
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)
+    return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]))

@@ -31,7 +31,7 @@ def option(
     return field(default=default, metadata=meta)
 
 
-AccUnit = Literal["m/s2", "g", "mg", "counts"]
+AccUnit = Literal["m/s2", "g", "mg", "cm/s2", "counts"]
 GyroUnit = Literal["rad/s", "deg/s", "mdeg/s", "counts"]
 
 

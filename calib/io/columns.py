@@ -80,7 +80,7 @@ _DEGREE = math.pi / 180.0
 
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "accel": {"m/s2": 1.0, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2, "counts": 1.0},
+    "accel": {"m/s2": 1.0, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2, "cm/s2": 0.01, "counts": 1.0},
     "gyro": {"rad/s": 1.0, "deg/s": _DEGREE, "mdeg/s": 1e-3 * _DEGREE, "counts": 1.0},
     "angle": {"rad": 1.0, "deg": _DEGREE},
     "pixel": {"px": 1.0},
@@ -94,6 +94,7 @@ _SPELLED = {
     "s": "s sec secs second seconds", "ms": "ms msec msecs millis millisecond milliseconds",
     "us": "us µs μs usec micros microsecond microseconds", "ns": "ns nanos nanosecond nanoseconds",
     "m/s2": "m/s2 m/s^2 m/s² m/s/s ms2 mps2 m_s2 ms-2 ms^-2", "g": "g gs gee", "mg": "mg",
+    "cm/s2": "cm/s2 cm/s^2 cm/s² cmps2 gal",
     "rad/s": "rad/s rads radps rad_s rad/sec", "deg/s": "deg/s °/s dps degps degs deg_s deg/sec",
     "mdeg/s": "mdps mdeg/s", "rad": "rad", "deg": "deg degree degrees °", "px": "px pixel pixels pix",
     "counts": "raw lsb count counts adc", "percent": "% percent",
@@ -124,6 +125,7 @@ _IN_PLANE_G = (0.85, 1.15)
 """Specific force of a calm log over g, of three axes and of two, which may lean out of the plane."""
 _STRANGE_G = (0.4, 2.5)
 """Specific force over g outside of which a unit that is stated is not believed."""
+_NO_GRAVITY = 0.3
 _CALM, _CALM_WINDOW = 0.1, 50
 _FASTEST_RADPS = 45.0
 _LARGEST_BIAS_RADPS = 0.35
@@ -613,21 +615,32 @@ def _with_accel(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMa
     norm = float(np.median(np.linalg.norm(calm_windows(values), axis=2)))
     bounds = _ABOUT_G if len(names) == 3 else _IN_PLANE_G
     units = UNITS["accel"]
-    likely = [u for u in ("m/s2", "g", "mg") if bounds[0] <= norm * units[u] / GRAVITY_MPS2 <= bounds[1]]
+    likely = [u for u in units if bounds[0] <= norm * units[u] / GRAVITY_MPS2 <= bounds[1] and u != "counts"]
     found = f"the specific force is {norm:.4g} where the log is calm"
     unit = next(iter(stated), "")
+    if not unit and len(likely) > 1:
+        # Two per cent lie between mg and cm/s^2, and more in how level a rig stands.
+        raise BadInputError(
+            f"{columns.source}: {found}, so it is in {' or in '.join(likely)}; "
+            f"{_advice('acc', 'accel', '|'.join(likely), columns)}"
+        )
     if unit in ("", *likely) and likely:
-        return _with(columns, names, likely[0], found)
+        return _with(columns, names, unit or likely[0], found)
     least = 0.0 if len(names) == 2 else _STRANGE_G[0]
     fits = bool(unit) and least <= norm * units[unit] / GRAVITY_MPS2 <= _STRANGE_G[1]
     if likely and not (fits and len(names) == 2 and columns.sources[names[0]].stated != "name"):
-        advice = _advice("acc", "accel", likely[0], columns)
-        # Two per cent lie between them, and more in how level a rig stands.
-        advice += ", or for cm/s^2 each axis with factor: 0.01" if likely[0] == "mg" else ""
-        raise BadInputError(f"{columns.source}: {found}, so it is in {likely[0]}, not in {unit}; {advice}")
+        advice = _advice("acc", "accel", "|".join(likely), columns)
+        raise BadInputError(
+            f"{columns.source}: {found}, so it is in {' or in '.join(likely)}, not in {unit}; {advice}"
+        )
     if fits:
         # Two axes may be far from the vertical, and a short log be never calm.
         return columns
+    if norm < _NO_GRAVITY:
+        raise BadInputError(
+            f"{columns.source}: {found}, so that gravity is missing, as in a linear acceleration; expected "
+            "what an accelerometer feels, about 9.81 m/s^2 at rest"
+        )
     what = "no unit that is known here"
     if norm > 150.0:
         what = "raw counts, which calib imu intrinsics --acc-unit counts finds the scale of"
@@ -650,7 +663,7 @@ class Turning:
     ----------
     flat : whether gravity stays in the plane of x and y.
     by_force_rad, by_gyro_rad : turn within a second, RMS in the median window, the latter in the rates' unit.
-    spread_rad : of the force's angle in the plane over the log.
+    spread_rad : of the force's direction over the log, where it stays in the plane of its angle there.
     misfit : for each factor on the rates, what it leaves of the force's turns, as a share of them.
     turned_rad : the force's turns from block to block, RMS.
     """
@@ -702,7 +715,8 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
         misfit = {f: np.linalg.norm(means3[1:] - _turned(means3[:-1], -f * turn3), axis=1) for f in factors}
     whole = float(np.sqrt(np.mean(turned**2))) if len(turned) else 0.0
     share = {f: float(np.sqrt(np.mean(off**2))) / whole if whole > 0.0 else 1.0 for f, off in misfit.items()}
-    return Turning(flat, by_force, by_gyro, float(phi.std()), share, whole)
+    spread = float(phi.std()) if flat else float(np.linalg.norm(unit.std(axis=0)))
+    return Turning(flat, by_force, by_gyro, spread, share, whole)
 
 
 def _turned(u: FloatArray, by: FloatArray) -> FloatArray:
@@ -723,8 +737,7 @@ def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
         return columns
     unit, scales = next(iter(stated), ""), {u: UNITS["gyro"][u] for u in ("rad/s", "deg/s", "mdeg/s")}
     wrong = {u: _implausible(s, columns, cells, names, values) for u, s in scales.items()}
-    # Few boards send mdeg/s, which makes small of nearly any readings.
-    likely = [u for u in ("rad/s", "deg/s") if not wrong[u]] or [u for u in ("mdeg/s",) if not wrong[u]]
+    likely = [u for u in ("rad/s", "deg/s") if not wrong[u]]
     if unit:
         if not wrong[unit]:
             return columns
@@ -736,14 +749,24 @@ def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
     if len(likely) == 2:
         wrong |= {u: _too_far(scales[u], columns, cells) for u in likely}
         likely = [u for u in likely if not wrong[u]] or likely
+    # It makes small of nearly any readings, raw counts among them: the turns have to say so.
+    if not likely and not wrong["mdeg/s"] and _agrees(scales["mdeg/s"], columns, cells, names):
+        likely = ["mdeg/s"]
     if len(likely) == 1:
         others = "; ".join(f"in {u} it {wrong[u]}" for u in ("rad/s", "deg/s") if wrong[u])
         return _with(columns, names, likely[0], others)
     first = one_line(columns.sources[names[0]].column)[:40]
+    if likely:
+        raise BadInputError(
+            f"{columns.source}: cannot tell whether `{first}` is in rad/s or in deg/s, as either is "
+            f"possible; {_advice('gyro', 'gyro', 'rad/s|deg/s', columns)}"
+        )
+    # That of an MPU6050 at its finest range.
+    scaled = f"{{column: {_yaml(columns.sources[names[0]].column)}, unit: deg/s, factor: 0.00763}}"
     raise BadInputError(
-        f"{columns.source}: cannot tell whether `{first}` is in rad/s or in deg/s, as "
-        f"{'either is possible' if likely else 'neither fits'}; "
-        f"{_advice('gyro', 'gyro', 'rad/s|deg/s', columns)}"
+        f"{columns.source}: `{first}` is neither in rad/s nor in deg/s, in mdeg/s or in raw counts; "
+        f"{_advice('gyro', 'gyro', 'mdeg/s', columns)}, or for counts a line for each axis with the data "
+        f"sheet's scale, such as {names[0]}: {scaled}"
     )
 
 
@@ -782,6 +805,35 @@ def _too_far(scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray]) 
     return f"turns a marker that would be {radius_px:.3g} px away from the axis"
 
 
+def _turns(
+    scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray], names: Sequence[str]
+) -> tuple[Turning, FloatArray] | None:
+    """How rates in a unit of this many rad/s turn beside the specific force, and the readings (n, axes) of
+    both; None where there is no force in the plane or too little of both.
+    """
+    accel = _of(columns, ACCEL)
+    if "gz_radps" not in names or "ax_mps2" not in accel or "ay_mps2" not in accel:
+        return None
+    every = _together(cells, columns, ["t_s", *accel, *names])
+    every = every[(scale * np.abs(every[:, 1 + len(accel) :]) <= _FASTEST_RADPS).all(axis=1)]
+    if len(every) < 2 * _CALM_WINDOW:
+        return None
+    t = every[:, 0] * UNITS["time"][columns.sources["t_s"].unit]
+    force, rates = every[:, 1 : 1 + len(accel)], every[:, 1 + len(accel) :]
+    whole = len(accel) == 3 and len(names) == 3
+    others = [f for u, f in UNITS["gyro"].items() if u != "counts" and not math.isclose(f, scale)]
+    about = rates if whole else -rates[:, names.index("gz_radps")]
+    return turning(t, force, about, [scale, -scale, *others]), every[:, 1:]
+
+
+def _agrees(scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray], names: Sequence[str]) -> bool:
+    """Whether rates in a unit of this many rad/s turn as the specific force does."""
+    found = _turns(scale, columns, cells, names)
+    if found is None or not found[0].turned_rad > _LEAST_TURN_RAD:
+        return False
+    return min(found[0].misfit[scale], found[0].misfit[-scale]) < _AGREES
+
+
 def _implausible(
     scale: float,
     columns: ColumnMap,
@@ -795,25 +847,14 @@ def _implausible(
     sizes = scale * np.sort(np.abs(values).ravel())
     if sizes[-1 - few] > _FASTEST_RADPS:
         return f"reaches {sizes[-1]:.4g} rad/s"
-    accel = _of(columns, ACCEL)
-    if "gz_radps" not in names or "ax_mps2" not in accel or "ay_mps2" not in accel:
+    both = _turns(scale, columns, cells, names)
+    if both is None:
         return ""
-    every = _together(cells, columns, ["t_s", *accel, *names])
-    every = every[(scale * np.abs(every[:, 1 + len(accel) :]) <= _FASTEST_RADPS).all(axis=1)]
-    if len(every) < 2 * _CALM_WINDOW:
-        return ""
-    t = every[:, 0] * UNITS["time"][columns.sources["t_s"].unit]
-    force, rates = every[:, 1 : 1 + len(accel)], every[:, 1 + len(accel) :]
-    whole = len(accel) == 3 and len(names) == 3
-    others = [f for u, f in UNITS["gyro"].items() if u != "counts" and not math.isclose(f, scale)]
-    found = turning(
-        t, force, rates if whole else -rates[:, names.index("gz_radps")], [scale, -scale, *others]
-    )
+    found, readings = both
     mine = min(found.misfit[scale], found.misfit[-scale])
-    if found.turned_rad > _LEAST_TURN_RAD and mine > _AGREES:
-        better = min((found.misfit[f] for f in others), default=1.0)
-        if better < _AGREES:
-            return "does not turn with the accelerometer's angle"
+    others = [share for factor, share in found.misfit.items() if abs(factor) != scale]
+    if found.turned_rad > _LEAST_TURN_RAD and mine > _AGREES and min(others, default=1.0) < _AGREES:
+        return "does not turn with the accelerometer's angle"
     # An accelerometer that is stuck says nothing about the gyroscope.
     felt = found.by_force_rad > _LEAST_NOISE_RAD
     least_rad = max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad)
@@ -821,7 +862,7 @@ def _implausible(
         times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
         return f"turns {times:.3g} times as far as the accelerometer's angle"
     if found.spread_rad < _REST_RAD:
-        calm = calm_windows(every[:, 1:])[:, :, len(accel) :]
+        calm = calm_windows(readings)[:, :, -len(names) :]
         bias = scale * float(np.abs(np.median(calm, axis=(0, 1))).max())
         spread = scale * np.median(calm.std(axis=1), axis=0)
         if bias > _LARGEST_BIAS_RADPS:

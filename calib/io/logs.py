@@ -167,7 +167,7 @@ def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
     return replace(log, columns=columns, passed=log.passed + Passed(outside=int(outside.sum())))
 
 
-def _within(log: Log) -> Log:
+def within(log: Log) -> Log:
     """The log with blanks for cells that no sensor can have given."""
     columns, passed = dict(log.columns), log.passed
     for name, values in log.columns.items():
@@ -203,7 +203,9 @@ def _counter(t: FloatArray, steps: FloatArray) -> int:
     if not len(back) or not len(usual) or not np.array_equal(t, np.floor(t)):
         return 0
     most = _WRAPS_WITHIN * float(np.median(usual))
-    fits = (n for n in _COUNTERS if t.min() >= 0.0 and t.max() < n and (back + n <= most).all())
+    # A counter that is printed as a signed number goes on from minus half its size.
+    low, high = (0, 1) if t.min() >= 0.0 else (-0.5, 0.5)
+    fits = (n for n in _COUNTERS if low * n <= t.min() and t.max() < high * n and (back + n <= most).all())
     return next(fits, 0)
 
 
@@ -251,7 +253,7 @@ def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: Lo
     columns = _stated(source, path, tuple(cells), options)
     lines = np.arange(1, len(cells["t_s"]) + 1, dtype=np.int64)
     (log,) = _logs(columns, iter([Block(cells, lines)]))
-    return _within(log)
+    return within(log)
 
 
 def iter_log(
@@ -289,7 +291,7 @@ def iter_log(
         blocks = _logs(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
     if as_it_is:
         return blocks
-    return (_within(log) if picture_px is None else _in_picture(_within(log), picture_px) for log in blocks)
+    return (within(log) if picture_px is None else _in_picture(within(log), picture_px) for log in blocks)
 
 
 def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
@@ -544,10 +546,12 @@ def signals_of(
         raise BadInputError(f"{log.source}: has no reading of {_listed(optional)}")
     if not counts:
         refuse_counts(log, wanted)
+    check_time(log)
+    apart = None if partly else _apart(log, wanted)
+    log = log if apart is None else apart
     rows = log.sampled(*wanted) if not partly else _any(log, wanted)
     if len(rows) == 0:
         raise BadInputError(f"{log.source}: no row has all of {', '.join(wanted)}, expected them together")
-    check_time(log)
     watch = Watch(tuple(name for name in (*names, *optional) if name in IMU))
     watch.add(log)
     for a, b in watch.held:
@@ -559,8 +563,38 @@ def signals_of(
     if twice.any():
         kept = np.concatenate([[True], ~twice])
         rows, stamps, values = rows[kept], stamps[kept], values[kept]
-    findings = tuple(watch.findings(stuck=False))
+    findings = (*watch.findings(stuck=False), *([_APART] if apart is not None else []))
     return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
+
+
+_APART = Finding(
+    "remark",
+    "accelerometer and gyroscope have rows of their own; the accelerometer is read on straight lines between",
+)
+_FAR_APART = 5.0
+"""Steps of the accelerometer from which on what lies between is not known."""
+
+
+def _apart(log: Log, names: Sequence[str]) -> Log | None:
+    """The log with the accelerometer's readings at the gyroscope's times; None where they share their rows.
+
+    Some drivers send each sensor by itself, at a rate of its own.
+    """
+    accel, gyro = ([name for name in names if kind_of(name) == kind] for kind in ("accel", "gyro"))
+    if not accel or not gyro or len(accel) + len(gyro) < len(names):
+        return None
+    of, at = log.sampled(*accel), log.sampled(*gyro)
+    if min(len(of), len(at)) < _FEWEST or 2 * len(log.sampled(*names)) >= min(len(of), len(at)):
+        return None
+    t, wanted = log.t_s[of], log.t_s[at]
+    after = np.clip(np.searchsorted(t, wanted), 1, len(t) - 1)
+    known = (wanted >= t[0]) & (wanted <= t[-1])
+    known &= t[after] - t[after - 1] <= _FAR_APART * float(np.median(np.diff(t)))
+    columns = dict(log.columns)
+    for name in accel:
+        columns[name] = np.full(len(log), np.nan)
+        columns[name][at] = np.where(known, np.interp(wanted, t, log.columns[name][of]), np.nan)
+    return replace(log, columns=columns)
 
 
 def _any(log: Log, names: Sequence[str]) -> IntArray:

@@ -243,6 +243,8 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
         raise BadInputError(f"{where}: has a zero byte, expected a text file")
     separator = (file and file.separator) or _separator(head)
     names = _split(where, head.rstrip("\r\n"), separator)
+    if len(names) == 1 and any((known_name(word) or ("",))[0] == "t_s" for word in head.split()[:-1]):
+        raise BadInputError(f"{where}: has blanks between its columns, expected commas, semicolons or tabs")
     if len(names) > _MAX_COLUMNS:
         raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
     rows = b""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import signal
 import subprocess
 import sys
 import threading
@@ -93,7 +92,8 @@ class Board:
         """End the recording at hand as Ctrl-C does, and wait for its end."""
         process = self._process
         if process is not None:
-            process.send_signal(signal.SIGINT)
+            # Not SIGINT: of a page that was started in the background its children ignore that.
+            process.terminate()
             try:
                 process.wait(_PATIENCE_S)
             except subprocess.TimeoutExpired:
@@ -111,14 +111,16 @@ class Board:
         if process is None or process.poll() is None:
             return False
         out, said = process.communicate()
-        self._process = None
         self._more()
-        lines = [line.removeprefix("calib: ") for line in said.strip().splitlines() if line]
-        self.last = (lines or ["the recording ended without a word"])[-1][:_MOST_WORDS]
         if process.returncode == 0 and self.path is not None:
             logs = json.loads(out)["record"]["logs"]
             self.last = "; ".join(f"{one['ticks']} ticks in {one['log']}, {one['lost']} lost" for one in logs)
             self.done.append(self.path.name)
+        else:
+            lines = [line.removeprefix("calib: ") for line in said.strip().splitlines() if line]
+            self.last = (lines or ["the recording ended without a word"])[-1][:_MOST_WORDS]
+        # Whoever sees that it is over finds what it said.
+        self._process = None
         return True
 
     def _more(self) -> None:

@@ -198,6 +198,9 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
         period = float(np.median((t[anchors[lag:]] - t[anchors[:-lag]]) / (anchors[lag:] - anchors[:-lag])))
     k = _counted(t[anchors], i[anchors], period, _UNEVEN * size)
     if k is None:
+        # A gap at the end of the first chunk is counted in the wrong place and bends its line.
+        k = _counted(t[anchors], i[anchors], period, _UNEVEN * size, held=True)
+    if k is None:
         return None
     origin, period, _ = _line(k, t[anchors])
     if not period > 0.0:
@@ -286,10 +289,13 @@ def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
     return origin, period, spread
 
 
-def _counted(t: FloatArray, i: IntArray, period: float, uneven: float) -> FloatArray | None:
+def _counted(
+    t: FloatArray, i: IntArray, period: float, uneven: float, held: bool = False
+) -> FloatArray | None:
     """Numbers k (n,) of the samples i (n,); None where they are not steady.
 
-    Each chunk is counted on from the line through those before it.
+    Each chunk is counted on from the line through those before it. Where the period is `held` it is still the
+    given one after the first chunk.
     """
     k = np.zeros(len(t))
     origin, nominal, done, chunk = float(t[0] - period * i[0]), period, 0, _FIRST
@@ -308,9 +314,13 @@ def _counted(t: FloatArray, i: IntArray, period: float, uneven: float) -> FloatA
             chunk //= 2
             recent = slice(max(done - 2 * chunk, 0), done)
             origin, period, _ = _line(k[recent], t[recent])
+            if not period > 0.0:
+                return None
             continue
         recent = slice(max(end - 2 * chunk, 0), end)
         origin, period, spread = _line(k[recent], t[recent])
+        if held and not done and end < len(t):
+            origin, period = float(np.median(t[recent] - nominal * k[recent])), nominal
         if not 0.5 * nominal < period < 2.0 * nominal or spread > uneven * period:
             return None
         # The last ones are looked at once more, with those that follow.

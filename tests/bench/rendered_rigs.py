@@ -105,11 +105,12 @@ def drawn(seed: int, off_mm: float = 0.0, wrong: str | None = None) -> Simulated
         rig = replace(rig, strength=(0.85 * rig.strength[0], 0.85 * rig.strength[1]))
     rng = np.random.default_rng(9000 + seed)
     louder = float(rng.uniform(0.8, 1.25))
+    across = float(np.random.default_rng(7000 + seed).uniform(-4e-3, 4e-3))
     imu = replace(
         rig.imu,
         gyro_noise=louder * rig.imu.gyro_noise,
         accel_noise=louder * rig.imu.accel_noise,
-        lever_m=(0.0, float(rng.uniform(0.004, 0.008))),
+        lever_m=(across, float(rng.uniform(4e-3, 8e-3))),
     )
     tracker = replace(
         rig.tracker,

@@ -354,6 +354,14 @@ def test_there_and_back(calib, rig, tmp_path, form: str) -> None:
     assert list(yaml.safe_load(other.read_text())["provenance"]["inputs"]["camera"]) == [file.name]
 
 
+def test_one_camera_of_a_chain_is_taken_and_the_others_are_named(calib, rig, tmp_path) -> None:
+    file = tmp_path / "camchain.yaml"
+    assert calib("export", "kalibr", "--rig", rig, "-o", file).code == 0
+    one = file.read_text()
+    file.write_text(one + one.replace("cam0", "cam1"))
+    assert "cam0 is taken, cam1 left out" in calib("import", "kalibr", file, "--rig", tmp_path / "a.yaml").out
+
+
 BAD = {
     "empty": b"",
     "a list": b"- 1\n",

@@ -42,6 +42,16 @@ def test_a_bag_becomes_a_table(calib: Run, tmp_path: Path) -> None:
     assert "left out: /marker, /pwm" in calib("convert", bag, "-o", out, "--topics", topics).err
 
 
+def test_what_other_verbs_refuse_is_told_where_it_is_converted(calib: Run, tmp_path: Path) -> None:
+    log, out = tmp_path / "log.csv", tmp_path / "si.csv"
+    log.write_text("t_s,gz_radps\n0.00,0.1\n0.01,1000\n0.02,0.1\n0.00,0.1\n0.01,0.1\n")
+    ended = calib("convert", log, "-o", out)
+    assert ended.code == 0
+    assert "1 cells hold more than any sensor gives (gz_radps is 1000 in line 3)" in ended.err
+    assert "line 5: the time goes back to 0 s; other verbs refuse that" in ended.err
+    assert ",1000\n" in out.read_text()
+
+
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_table_comes_back(
@@ -67,6 +77,7 @@ def test_a_table_comes_back(
         ("t_s,gz_radps\n", "out.csv", 3, "has a header but no rows"),
         ("t_s,gz_radps\n0,1\n", "out.mcap", 2, "expected a name that ends in .csv or .parquet"),
         ("t_s,gz_radps\n0,x\n", "out.csv", 3, "line 2: gz_radps is 'x', expected a number"),
+        ("t gz ax\n0 1 2\n", "out.csv", 3, "line 1: has blanks between its columns, expected commas"),
     ],
 )
 def test_what_cannot_be_converted(

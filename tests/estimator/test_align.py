@@ -210,12 +210,13 @@ TRUTH = sensor_values(
         "mount_angle_rad": 0.03,
         "gyro_scale": 0.006,
         "imu_lever_m": 0.006,
+        "imu_across_m": -0.002,
         "marker_offset_m": 0.0155,
         "time_offset_s": 0.031,
     }
 )
 MEAN = sensor_values({"marker_offset_m": 0.015, "time_offset_s": 0.025})
-SIGMA = np.array([0.1, 0.3, 0.3, 0.5, 0.02, 0.02, 0.003, 0.05, 5e-5, 5e-5, 1e-3, 0.01, 0.01])
+SIGMA = np.array([0.1, 0.3, 0.3, 0.5, 0.02, 0.02, 0.003, 0.05, 5e-5, 5e-5, 1e-3, 0.01, 0.01, 0.01])
 NOISE = Noise(0.3, 0.003, np.array([0.015, 0.015, 0.0025]))
 
 
@@ -260,8 +261,8 @@ def test_covariance_is_that_of_repeated_fits() -> None:
     for seed in range(40):
         problem, _ = _problem(noisy=True, seed=seed)
         # The truth is drawn about the prior's mean, as the covariance takes it.
-        shift = np.random.default_rng(1000 + seed).standard_normal(13)
-        mean = TRUTH + SIGMA * np.where(np.arange(13) >= 8, shift, 0.0)
+        shift = np.random.default_rng(1000 + seed).standard_normal(len(SENSOR))
+        mean = TRUTH + SIGMA * np.where(np.arange(len(SENSOR)) >= 8, shift, 0.0)
         fit = solve(replace(problem, mean=mean), mean, NOISE)
         assert fit.converged
         found.append(fit.sensor - TRUTH)
@@ -321,7 +322,7 @@ def test_a_swing_of_four_hertz_is_met_with_its_acceleration() -> None:
     for n in range(len(t)):
         A[n, span[n] : span[n] + 6] = basis[n, 0]
     c = np.linalg.lstsq(A, 0.5 * np.sin(omega * t), rcond=None)[0]
-    states = states_of(span, basis, np.stack([c, c], axis=1), np.zeros(13))
+    states = states_of(span, basis, np.stack([c, c], axis=1), np.zeros(len(SENSOR)))
     bend = -0.5 * omega**2 * np.sin(omega * t)
     inside = slice(50, -50)
     assert np.abs(states[inside, 4] - bend[inside]).max() < 1e-3 * 0.5 * omega**2
@@ -345,7 +346,7 @@ def test_gradients_by_coefficients_and_sensors_against_differences() -> None:
 
     at = np.concatenate([c.ravel(), sensor])
     weights = rng.standard_normal(len(predicted(at)))
-    to_c, to_s = np.zeros(c.size), np.zeros(13)
+    to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
     rows = camera_rows(numbers, knots, c, sensor, t)
     gathered(rows.span, rows.basis, rows.by, weights[:14].reshape(7, 2), to_c, to_s)
     rows = imu_rows(knots, c, sensor, t)
@@ -367,9 +368,10 @@ def test_sums_are_those_of_the_dense_matrices() -> None:
     span, basis = basis_rows(knots, t)
     by, weight = rng.standard_normal((40, 2, SIZE)), rng.uniform(0.0, 2.0, (40, 2))
     n = 2 * knots.count
-    A, B, C = np.zeros((BAND, n)), np.zeros((n, 13)), np.zeros((13, 13))
+    m = len(SENSOR)
+    A, B, C = np.zeros((BAND, n)), np.zeros((n, m)), np.zeros((m, m))
     normal_sums(span, basis, by, weight, A, B, C)
-    J = np.zeros((80, n + 13))
+    J = np.zeros((80, n + m))
     for i in range(40):
         for channel in range(2):
             row = J[2 * i + channel]

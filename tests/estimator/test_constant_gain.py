@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from calib.stages.estimator.constant_gain import (
     tick_noise,
 )
 from calib.stages.estimator.kinematic import Setup
+from calib.stages.estimator.section import EstimatorGain
 from calib.stages.estimator.sensors import head_position
 
 NOISE = TickNoise(8.6e-3, 4.3e-4, 2e-3, 0.025)
@@ -128,6 +130,13 @@ def test_the_angles_gains_are_the_limit_of_the_time_varying_filter() -> None:
     np.testing.assert_allclose(K[0], [gains.camera_phi, gains.accel_phi], rtol=1e-6)
     # The bias takes the same share of both corrections.
     np.testing.assert_allclose(K[1] / K[0], gains.bias, rtol=1e-6)
+
+
+def test_gains_of_a_precise_and_late_camera_stand_in_the_file() -> None:
+    """A length is then corrected by more than its residual."""
+    gains = design(TickNoise(3e-5 / 0.0475, 3e-5, NOISE.gyro_radps, NOISE.accel_rad), 60.0, 7.9 * T, 0.0475)
+    assert gains.moving_length > 1.0
+    assert EstimatorGain(**asdict(gains)).moving_length == gains.moving_length
 
 
 @pytest.mark.parametrize("ticks", [0.0, 0.4, 1.5, 3.0, float(MOST_DELAY_TICKS)])

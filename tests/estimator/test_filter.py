@@ -311,7 +311,7 @@ def _one_event(
     level, walk = process.arrays()
     report = np.empty(len(REPORT))
     bank_event(
-        bank_x, bank_P, weights, 0, 1, kind, np.array(z), 0.0, 0.3, level, walk, setup.view,
+        bank_x, bank_P, weights, 0, 1, kind, np.array([*z, 0.0]), 0.0, 0.3, level, walk, setup.view,
         setup.noise, np.zeros((levels, *WORK)), np.zeros((levels, 7)), False, report,
         np.zeros(3), np.empty((0, TRACE)),
     )  # fmt: skip
@@ -339,7 +339,7 @@ def test_an_event_is_joseph_s_form_reading_by_reading_but_for_what_is_considered
         camera_terms(setup.view, noise, noise[6] ** 2, before, P, H, out)
         order, R = [0, 1], out[3:5].copy()
     else:
-        imu_terms(noise, before, P, H, out)
+        imu_terms(noise, noise[7] ** 2, before, P, H, out)
         order, R = [2, 0, 1], out[3:6].copy()
     for k in order:
         S = H[k] @ P @ H[k] + R[k]
@@ -434,6 +434,15 @@ def test_jitter_is_removed() -> None:
     assert rms(error[500:]) < 0.15 * 4e-4
 
 
+def test_a_repeated_stamp_takes_no_sample_back() -> None:
+    """It is early by a period, as where one sample too many was counted."""
+    true, stamps = jittered()
+    again = np.random.default_rng(2).uniform(size=len(true)) < 0.005
+    stamps[1:][again[1:]] = stamps[:-1][again[1:]]
+    error = even_times(new_clock(PERIOD), stamps)[0] - true
+    assert np.abs(error[500:]).max() < 4e-4
+
+
 def test_missing_samples_are_counted() -> None:
     true, stamps = jittered()
     keep = np.random.default_rng(1).uniform(size=len(true)) > 0.1
@@ -441,6 +450,20 @@ def test_missing_samples_are_counted() -> None:
     error = even_times(new_clock(PERIOD), stamps[keep])[0] - true[keep]
     assert rms(error[500:]) < 0.2 * 4e-4
     assert np.abs(error[500:]).max() < 4e-4
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.005])
+def test_stamps_that_jitter_by_a_fifth_of_a_period_count_no_sample_that_was_not_missing(
+    missing: float,
+) -> None:
+    """A slip by one sample turns an angle by what the head turns within a period."""
+    slipped = []
+    for seed in range(4):
+        true, stamps = jittered(10_000, 2e-3, seed)
+        keep = np.random.default_rng(seed).random(len(true)) >= missing
+        error = even_times(new_clock(PERIOD), np.maximum.accumulate(stamps)[keep])[0] - true[keep]
+        slipped.append(np.mean(np.abs(error[500:]) > 0.6 * PERIOD))
+    assert np.mean(slipped) < 0.002
 
 
 @pytest.mark.parametrize("jitter", [0.2, 0.5])
@@ -536,9 +559,10 @@ SPREAD = np.array(
         0.02,
         0.01,
         0.01,
+        0.004,
     ]
 )
-MIDDLE_SENSORS = np.zeros(19)
+MIDDLE_SENSORS = np.zeros(sensors.SIZE)
 MIDDLE_SENSORS[1], MIDDLE_SENSORS[11], MIDDLE_SENSORS[12] = 0.07, 0.006, 0.015
 
 
@@ -549,15 +573,15 @@ def view(camera: Camera | None = None) -> FloatArray:
 
 def states(count: int) -> FloatArray:
     """Random motions, straight and nearly straight ones among them."""
-    out = MIDDLE_SENSORS + SPREAD * np.random.default_rng(4).uniform(-1.0, 1.0, (count, 19))
+    out = MIDDLE_SENSORS + SPREAD * np.random.default_rng(4).uniform(-1.0, 1.0, (count, sensors.SIZE))
     out[0] = MIDDLE_SENSORS
     out[1:8, 0] = 10.0 ** -np.arange(1.0, 15.0, 2.0)
     return np.asarray(out)
 
 
 def readings(state: FloatArray, camera: Camera | None = None) -> tuple[FloatArray, FloatArray]:
-    """All five readings (5,) and their gradients (5, 19)."""
-    by = np.empty((5, 19))
+    """All five readings (5,) and their gradients (5, 20)."""
+    by = np.empty((5, sensors.SIZE))
     u, v = sensors.marker(view(camera), state, by[0], by[1])
     ax, ay = sensors.accelerometer(state, by[2], by[3])
     return np.array([u, v, ax, ay, sensors.gyroscope(state, by[4])]), by
@@ -572,9 +596,9 @@ FISHEYE = Camera(
 def test_gradients_agree_with_differences(camera: Camera | None) -> None:
     for state in states(60):
         _, by = readings(state, camera)
-        for k in range(19):
+        for k in range(sensors.SIZE):
             h = 1e-4 * SPREAD[k]
-            step = h * (np.arange(19) == k)
+            step = h * (np.arange(sensors.SIZE) == k)
             low2, low, high, high2 = (readings(state + a * step, camera)[0] for a in (-2.0, -1.0, 1.0, 2.0))
             difference = (low2 - high2 + 8.0 * (high - low)) / (12.0 * h)
             np.testing.assert_allclose(by[:, k], difference, rtol=1e-6, atol=1e-6 * np.abs(by).max())
@@ -599,10 +623,10 @@ def test_accelerometer_and_gyroscope_agree_with_the_simulated_imu() -> None:
     rows[:, 9] = 0.05
     rows[:, 17], rows[:, 18] = 0.004, -0.003
     rows[:, 10] = -0.01
-    rows[:, 11] = 0.006
+    rows[:, 11], rows[:, 19] = 0.006, -0.003
     rows[:, 6:9] = 0.01, 0.05, -0.04
     imu = replace(
-        Imu(), mount_angle_rad=0.05, lever_m=(0.0, 0.006), gyro_scale=(0.0, 0.0, -0.01),
+        Imu(), mount_angle_rad=0.05, lever_m=(-0.003, 0.006), gyro_scale=(0.0, 0.0, -0.01),
         accel_scale=(0.004, -0.003, 0.0), gyro_step_radps=0.0, accel_step_mps2=0.0,
         accel_range_mps2=1e6, gyro_range_radps=1e6,
     )  # fmt: skip

@@ -54,7 +54,8 @@ def test_a_loose_alignment_makes_the_smoother_no_worse_than_the_filter() -> None
     for seed in (0, 1, 2, 3):
         rig, log = simulated("step", seed)
         setup, rows = setup_for(rig, seed), rows_from(log)
-        value = truth_of_sensors(rig) + np.linalg.cholesky(V) @ np.random.default_rng(seed).normal(size=13)
+        value = truth_of_sensors(rig)
+        value += np.linalg.cholesky(V) @ np.random.default_rng(seed).normal(size=len(V))
         value[8:11] = 0.0
         setup = replace(
             setup,

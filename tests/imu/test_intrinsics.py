@@ -352,6 +352,7 @@ def _turns(poses: list, d: int, rng: np.random.Generator | None, noise: tuple[fl
         rests,
         np.stack([gyro[rest.start : rest.stop].mean(axis=0) for rest in rests]),
         scatter,
+        np.zeros(3),
         0,
         1.0 / RATE_HZ,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import allantools
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from calib.solve.clock import Part
 from calib.stages.imu.allan import (
@@ -211,17 +213,60 @@ def test_noise_and_a_walk_are_no_steps() -> None:
         assert analyse_static([rest_log(imu, 400.0, seed)[0]]).logs[0].steps == ()
 
 
-def test_coloured_noise_is_a_remark_with_its_consequence() -> None:
+@pytest.mark.parametrize(("lasts_s", "word"), [(0.5, "poor"), (5.0, "ok")])
+def test_coloured_noise_is_told_with_its_consequence(lasts_s: float, word: str) -> None:
     log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 1200.0, 6)
-    rng, coloured = np.random.default_rng(6), log.values.copy()
-    share = np.exp(-1.0 / (100.0 * 0.5))
-    slow = np.zeros(len(coloured))
-    for i, one in enumerate(rng.normal(size=len(slow) - 1), start=1):
-        slow[i] = share * slow[i - 1] + one
-    coloured[:, 4] += 0.005 * slow * np.sqrt(1.0 - share**2)
+    coloured = log.values.copy()
+    share = np.exp(-1.0 / (100.0 * lasts_s))
+    slow = lfilter(
+        [np.sqrt(1.0 - share**2)], [1.0, -share], np.random.default_rng(6).normal(size=len(coloured))
+    )
+    coloured[:, 4] += 0.005 * slow
     judged = judge(analyse_static([replace(log, values=coloured)]))
-    assert judged.word == "ok"
-    assert any("ay: its noise is coloured" in text and "too little" in text for text in judged.remarks)
+    assert judged.word == word
+    told = "trusts it by as much too far" if word == "ok" else "do not describe it"
+    assert any(
+        "ay: its noise is coloured" in text and told in text for text in (*judged.reasons, *judged.remarks)
+    )
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    return np.repeat(values[::4], 4, axis=0)[: len(values)] / 2.0
+
+
+def _filtered(values: np.ndarray) -> np.ndarray:
+    """By a sensor's own low-pass at 5 Hz, of unit gain at rest."""
+    share = np.exp(-2.0 * np.pi * 5.0 / 100.0)
+    return np.asarray(lfilter([1.0 - share], [1.0, -share], values, axis=0))
+
+
+@pytest.mark.parametrize("change", [_held, _filtered])
+def test_white_noise_is_found_behind_a_filter_and_in_readings_that_are_held(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    z = []
+    for seed in range(8):
+        white = change(np.random.default_rng(seed).normal(size=40_000))
+        N = analyse([np.ascontiguousarray(white)], 0.01).N
+        z.append((N.value - 0.1) / N.sigma)
+    assert abs(np.mean(z)) < 1.6
+    assert np.max(np.abs(z)) < 3.5
+
+
+@pytest.mark.parametrize(("spread", "told"), [(0.15, True), (0.3, True), (0.8, False)])
+def test_readings_with_less_noise_than_a_step_have_a_bias_that_their_rounding_shifts(
+    spread: float, told: bool
+) -> None:
+    step, z = 0.001, []
+    for place in np.linspace(0.0, 0.9, 10):
+        rng, bias = np.random.default_rng(3), (5.0 + place) * step
+        gz = step * np.rint((bias + spread * step * rng.normal(size=30_000)) / step)
+        values = np.column_stack([gz, rng.normal(9.81, 0.02, len(gz)), rng.normal(0.0, 0.02, len(gz))])
+        log = Readings("log", ("gz", "ax", "ay"), 0.01 * np.arange(len(gz)), values)
+        noise = analyse_static([log]).noise[0]
+        assert (noise.rounded > 0.0) == told
+        z.append((noise.bias - bias) / noise.sigma)
+    assert np.max(np.abs(z)) < 3.0
 
 
 def _nbs14() -> np.ndarray:

@@ -79,16 +79,13 @@ def test_the_names_of_the_format_mean_themselves() -> None:
 
 
 @pytest.mark.parametrize("moving", [True, False])
-@pytest.mark.parametrize(("acc", "gyro"), [("g", "deg/s"), ("m/s2", "rad/s"), ("mg", "mdeg/s")])
+@pytest.mark.parametrize(("acc", "gyro"), [("g", "deg/s"), ("m/s2", "rad/s")])
 @pytest.mark.parametrize(("time", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6)])
 def test_units_are_inferred_from_the_readings(
     tmp_path: Path, moving: bool, acc: str, gyro: str, time: str, scale: float
 ) -> None:
     t, values = _imu(moving)
-    per = (
-        {"g": 1 / G, "m/s2": 1.0, "mg": 1e3 / G}[acc],
-        {"deg/s": 1 / DEGREE, "rad/s": 1.0, "mdeg/s": 1e3 / DEGREE}[gyro],
-    )
+    per = {"g": 1 / G, "m/s2": 1.0}[acc], {"deg/s": 1 / DEGREE, "rad/s": 1.0}[gyro]
     columns = [scale * t, *(per[0] * values[:, :3]).T, *(per[1] * values[:, 3:]).T]
     path = _written(tmp_path / "log.csv", ["time", "ax", "ay", "az", "gx", "gy", "gz"], columns)
     log = read_log(path)
@@ -143,7 +140,21 @@ def test_a_file_without_a_header(tmp_path: Path) -> None:
         # A person who does.
         (NAMED, (1, 1, 1), {"acc_unit": "g"}, "is in m/s2, not in g; give --acc-unit m/s2"),
         (NAMED, (1, 1, 1), {"gyro_unit": "deg/s"}, "none does in deg/s; if it is in rad/s"),
+        # One of two that are alike.
+        ("t ax ay az gx gy gz", (1, 100, 1), {}, "981.* in mg or in cm/s2; give --acc-unit mg|cm/s2 or add"),
+        (
+            "t ax ay az gx gy gz",
+            (1, 1e3 / G, 1),
+            {},
+            "100.*so it is in mg or in cm/s2; give --acc-unit mg|cm/s2",
+        ),
         # No unit that is known.
+        (
+            "t ax ay az gx gy gz",
+            (1, 1, 131 / DEGREE),
+            {},
+            r"neither in rad/s nor in deg/s.*gx_radps: \{column: gx, unit: deg/s,",
+        ),
         ("t ax ay az gx gy gz", (1, 1670, 1), {}, r"raw counts.*ax_mps2: \{column: ax, factor:"),
         (NAMED, (1, 3, 1), {}, "the specific force is 29.* where the log is calm"),
         # Two columns for one.
@@ -159,6 +170,42 @@ def test_what_the_readings_contradict_is_refused_with_what_to_do(
     path = _written(tmp_path / "log.csv", names.split(), columns)
     with pytest.raises(BadInputError, match=words):
         read_log(path, LogOptions(**options))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e3, "mdeg/s"), (131.0, "")])
+@pytest.mark.parametrize("moving", [True, False])
+def test_millidegrees_are_read_where_the_turns_say_so(
+    tmp_path: Path, scale: float, unit: str, moving: bool
+) -> None:
+    """Raw counts of an MPU6050 look like them: at rest they make any noise that of a good gyroscope."""
+    t, values = _imu(moving)
+    columns = [t, *values[:, :3].T, *np.rint(values[:, 3:] * scale / DEGREE).T]
+    path = _written(tmp_path / "log.csv", ["t", "ax", "ay", "az", "gx", "gy", "gz"], columns)
+    if unit and moving:
+        log = read_log(path)
+        assert log.map is not None and log.map.sources["gz_radps"].unit == unit
+        assert np.allclose(log.columns["gz_radps"], values[:, 5], atol=1e-4)
+        return
+    with pytest.raises(BadInputError, match="neither in rad/s nor in deg/s, in mdeg/s or in raw counts"):
+        read_log(path)
+
+
+@pytest.mark.parametrize("gyro", ["deg/s", "rad/s"])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_board_that_lies_flat_tells_the_unit_of_its_gyroscope(
+    tmp_path: Path, gyro: str, named: bool
+) -> None:
+    """Gravity is along z, so that atan2(ay, ax) is noise."""
+    t, values = _imu(moving=False)
+    values = values[:, [1, 2, 0, 3, 4, 5]] + [0.0, 0.0, 0.0, 0.004, -0.003, 0.006]
+    columns = [t, *values[:, :3].T, *(values[:, 3:] / (DEGREE if gyro == "deg/s" else 1.0)).T]
+    names = ["t_s", *AXES] if named else ["t", "ax", "ay", "az", "gx", "gy", "gz"]
+    path = _written(tmp_path / "log.csv", names, columns)
+    if named and gyro == "deg/s":
+        with pytest.raises(BadInputError, match="in deg/s, give --gyro-unit deg/s"):
+            read_log(path)
+        return
+    assert np.allclose(read_log(path).columns["gz_radps"], values[:, 5], atol=1e-6)
 
 
 def test_a_unit_that_a_person_states(tmp_path: Path) -> None:

@@ -356,13 +356,22 @@ def test_a_full_disk_is_one_sentence(ending: str, tmp_path: Path) -> None:
     assert str(caught.value) == f"{path}: cannot be written: No space left on device"
 
 
-@pytest.mark.parametrize(("bits", "name"), [(16, "millis"), (32, "millis"), (32, "micros")])
+@pytest.mark.parametrize(
+    ("bits", "name", "low"),
+    [
+        (16, "millis", 0),
+        (32, "millis", 0),
+        (32, "micros", 0),
+        (32, "micros", -(2**31)),
+        (16, "millis", -(2**15)),
+    ],
+)
 def test_a_time_that_begins_again_is_counted_on(
-    write, monkeypatch: pytest.MonkeyPatch, bits: int, name: str
+    write, monkeypatch: pytest.MonkeyPatch, bits: int, name: str, low: int
 ) -> None:
     step, unit_s = (10, 1e-3) if name == "millis" else (10_000, 1e-6)
-    counts = 2**bits - 3000 + step * np.arange(20_000)
-    rows = "".join(f"{t},{k % 7}\n" for k, t in enumerate(counts % 2**bits))
+    counts = low + 2**bits - 3000 + step * np.arange(20_000)
+    rows = "".join(f"{t},{k % 7}\n" for k, t in enumerate((counts - low) % 2**bits + low))
     path = write(f"{name},u_px\n{rows}")
     for size in (1 << 20, 1000):
         monkeypatch.setattr(tables, "_BLOCK_BYTES", size)

@@ -42,6 +42,24 @@ def test_rows_with_all_columns() -> None:
     assert (len(either), either.names) == (3000, ("u_px", "gz_radps"))
 
 
+def test_an_accelerometer_with_rows_of_its_own_is_read_between_them() -> None:
+    """As some drivers send it: 200 Hz of one sensor and 63 of the other, no row with both."""
+    t = 0.001 * np.arange(9000)
+    gyro, accel = np.arange(9000) % 5 == 0, np.arange(9000) % 16 == 3
+    accel[4000:4500] = False
+    phi = 0.5 * np.sin(1.3 * t)
+    columns = {
+        "gz_radps": np.where(gyro & ~accel, -0.65 * np.cos(1.3 * t), np.nan),
+        "ax_mps2": np.where(accel, G * np.cos(phi), np.nan),
+        "ay_mps2": np.where(accel, G * np.sin(phi), np.nan),
+    }
+    signals = Log("log.csv", t, columns, np.arange(2, 9002)).signals(*IN_PLANE)
+    assert np.abs(signals["ay_mps2"] - G * np.sin(0.5 * np.sin(1.3 * signals.t_s))).max() < 1e-3
+    assert not ((signals.t_s > 4.005) & (signals.t_s < 4.495)).any()
+    assert len(signals) > 0.85 * gyro.sum()
+    assert any("rows of their own" in finding.text for finding in signals.findings)
+
+
 def test_rows_that_were_written_twice_are_one_sample() -> None:
     log = _log()
     rows = np.sort(np.concatenate([np.arange(3000), np.arange(100, 2900, 480)]))

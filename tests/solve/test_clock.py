@@ -146,6 +146,14 @@ def test_missing_samples_are_counted(share: float) -> None:
     assert np.abs(part.values[:, 0] - part.t_s).max() < 1e-4
 
 
+def test_a_gap_at_the_end_of_the_first_chunk_does_not_bend_its_line() -> None:
+    rng = np.random.default_rng(5)
+    taken = 0.01 * np.arange(2000)[rng.random(2000) >= 0.02]
+    axis = time_axis(np.maximum.accumulate(taken + 1e-3 * rng.standard_normal(len(taken))))
+    assert axis.steady
+    assert np.abs(axis.t_s - taken).max() < 5e-4
+
+
 @pytest.mark.parametrize(
     ("missing", "jitter_s", "seed"),
     [(0.1, 0.005, seed) for seed in (73, 178, 250, 289, 974, 1497)]

@@ -794,6 +794,11 @@ def _pruned(
 
 def _blind(fixed: Mapping[str, str]) -> BadInputError:
     names = ", ".join(label_of(name) for name in fixed if name != "lambda3")
+    if not names:
+        return BadInputError(
+            "identify: nothing is left to identify: all that these logs could tell is fixed by `known`; "
+            "expected a parameter that is not stated"
+        )
     return BadInputError(
         f"identify: these logs cannot tell any parameter ({names}); expected logs in which the rig moves"
     )

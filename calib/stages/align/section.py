@@ -29,6 +29,7 @@ SENSORS_OF = {
     "accel_bias_mps2": ("accel_bias_x_mps2", "accel_bias_y_mps2"),
     "accel_scale": ("accel_scale_x", "accel_scale_y"),
     "imu_lever_m": ("imu_lever_m",),
+    "imu_across_m": ("imu_across_m",),
     "marker_offset_m": ("marker_offset_m",),
     "plane_shift_m": ("shift_x_m", "shift_y_m"),
     "plane_stretch": ("stretch",),
@@ -71,6 +72,7 @@ class Align(Result):
     rest_angle_rad : what atan2(ay, ax) reads at rest at phi = 0, biases and scales included.
     gyro_scale, accel_scale : scale errors; a rate w is read as (1 + gyro_scale) w. Lists hold x, y.
     imu_lever_m, marker_offset_m : places of IMU and marker along the head's tangent.
+    imu_across_m : place of the IMU across it, positive where x is at phi = 0; absent in earlier files.
     plane_shift_m, plane_stretch : by which the calibrated plane is off.
     sigma : standard deviations by key. prior_sigma : what was known beforehand, by `covariance.order`.
     covariance : of all of them; the marginal deviations of values that are hardly told apart are large while
@@ -87,6 +89,7 @@ class Align(Result):
     accel_bias_mps2: Annotated[list[Bias], Field(min_length=2, max_length=2)] = quantity(label="accel bias")
     accel_scale: SharePair = quantity(label="accel scale error", show="%")
     imu_lever_m: Metres = quantity(label="IMU along the head", show="mm")
+    imu_across_m: Metres | None = quantity(None, label="IMU across the head", show="mm")
     marker_offset_m: Metres = quantity(label="marker offset d", show="mm")
     plane_shift_m: MetresPair = quantity(label="shift of the plane", show="mm")
     plane_stretch: Share = quantity(label="stretch of the plane", show="%")

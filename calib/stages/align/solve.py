@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, integral
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none
@@ -141,7 +141,7 @@ def imu_terms(off: FloatArray, noise: FloatArray) -> tuple[float, FloatArray, Fl
 # ----------------------------------------------------------------------
 # The normal equations of an alignment: readings, noise, losses, and an arrow of banded blocks.
 #
-# Unknown are the coefficients c of each stretch's spline and the 13 quantities s of `SENSOR`, which all
+# Unknown are the coefficients c of each stretch's spline and the 14 quantities s of `SENSOR`, which all
 # stretches share. Gauss-Newton's normal equations are
 #
 #     [A_1           B_1] [dc_1]   [g_1]
@@ -195,7 +195,7 @@ class Problem:
     ----------
     view : (25,) of `sensors.view_coefficients`.
     grid_px : step of the pixels, 0 for none.
-    mean, sigma : (13,) prior of `SENSOR`.
+    mean, sigma : (14,) prior of `SENSOR`.
     """
 
     view: FloatArray
@@ -227,7 +227,7 @@ class Arrow:
         return steps, ds
 
     def size(self, ds: FloatArray) -> float:
-        """The largest of a step (13,) in deviations."""
+        """The largest of a step (14,) in deviations."""
         return float(np.max(np.abs(ds) / np.sqrt(np.diag(cho_solve(self.S, np.eye(len(ds)))))))
 
 
@@ -464,8 +464,7 @@ def _integrated(t: FloatArray, gz: FloatArray) -> FloatArray:
     if known.sum() < 2:
         return np.zeros(len(t))
     rate = -np.interp(t, t[known], _without_spikes(gz[known]))
-    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(t)
-    return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]))
+    return integral(t, rate)
 
 
 def pieces_of(
@@ -475,7 +474,7 @@ def pieces_of(
 
     Parameters
     ----------
-    sensor : (13,) prior of `SENSOR`.
+    sensor : (14,) prior of `SENSOR`.
     """
     pieces, said = [], []
     for number, log in enumerate(logs):
@@ -574,7 +573,8 @@ def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     if factor < -0.3:
         raise BadInputError(
             f"{log.source}: gz_radps turns the other way round than the camera sees, expected minus the rate "
-            "of phi (a right-handed IMU, its x axis from the head to the base)"
+            "of phi (a right-handed IMU, its x axis from the head to the base); a camera upside down "
+            "may have read the plane's board from its other end: state first_corner_px in its board.yaml"
         )
 
 
@@ -716,7 +716,7 @@ def check_accelerometer(problem: Problem, source: str, sensor: FloatArray) -> No
 
     Parameters
     ----------
-    sensor : (13,) of `SENSOR` with the mount angle 0.
+    sensor : (14,) of `SENSOR` with the mount angle 0.
     """
     power, straight, mirrored = 0.0, 0j, 0j
     for stretch in problem.stretches:
@@ -784,7 +784,7 @@ class Fit:
 
     Attributes
     ----------
-    sensor, covariance : (13,) and (13, 13) of `SENSOR`.
+    sensor, covariance : (14,) and (14, 14) of `SENSOR`.
     coefficients : of each stretch's spline. noise : that was found.
     good : for each stretch (n,), probability that a picture shows the marker.
     loss, steps, converged : of Gauss-Newton.
@@ -845,7 +845,7 @@ def _renewed(
 
 
 def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
-    """Fit from these quantities (13,) and this noise on.
+    """Fit from these quantities (14,) and this noise on.
 
     The noise is renewed after each step that is small or of which it was the third with the same noise.
     """
@@ -887,7 +887,7 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
 
 
 def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArray:
-    """Change (13,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
+    """Change (14,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
     stretch, c = problem.stretches[i], fit.coefficients[i]
     to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
     for off, rows in _readings(stretch, c, fit.sensor):
@@ -930,7 +930,7 @@ class Settings:
     Attributes
     ----------
     view : (25,) of `sensors.view_coefficients`.
-    mean, sigma : (13,) prior of `SENSOR`. The mount angle's mean is replaced by a first guess.
+    mean, sigma : (14,) prior of `SENSOR`. The mount angle's mean is replaced by a first guess.
     grid_px : step of the pixels. gyro_walk, accel_walk : densities K of the biases' walk.
     """
 
@@ -968,7 +968,7 @@ class Alignment:
 
     Attributes
     ----------
-    sensor, covariance : (13,) and (13, 13) of `SENSOR`; mean, prior : (13,) prior and its deviations.
+    sensor, covariance : (14,) and (14, 14) of `SENSOR`; mean, prior : (14,) prior and its deviations.
     noise, converged, steps : of the fit. moves : the first guess could see the offset. factor : of the
         gyroscope against the camera.
     correlation : (k,) of the camera's rate of angle with the gyroscope's at `OFFSETS_S`.
@@ -991,7 +991,7 @@ class Alignment:
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviations (13,)."""
+        """Standard deviations (14,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -1007,7 +1007,7 @@ class Alignment:
 
 
 def rest_angle(sensor: FloatArray) -> tuple[float, FloatArray]:
-    """Angle that the accelerometer reads at phi = 0 at rest, and its gradient (13,)."""
+    """Angle that the accelerometer reads at phi = 0 at rest, and its gradient (14,)."""
     alpha = sensor[_MOUNT]
     ca, sa = math.cos(alpha), math.sin(alpha)
     x = (1.0 + sensor[_SX]) * GRAVITY_MPS2 * ca + sensor[_AX]
@@ -1022,7 +1022,7 @@ def rest_angle(sensor: FloatArray) -> tuple[float, FloatArray]:
 
 
 def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
-    """Covariance (13, 13) from biases that differ from stretch to stretch."""
+    """Covariance (14, 14) from biases that differ from stretch to stretch."""
     total = np.zeros((len(SENSOR), len(SENSOR)))
     walks = np.diag([settings.accel_walk, settings.accel_walk, settings.gyro_walk])
     for i, stretch in enumerate(problem.stretches):

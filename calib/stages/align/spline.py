@@ -79,7 +79,7 @@ class Rows:
     Attributes
     ----------
     span : (n,) first coefficient of each. basis : (n, 3, 6) of value, first and second derivative.
-    predicted : (n, channels). by : (n, channels, 19), gradients as in `calib.stages.estimator.sensors`.
+    predicted : (n, channels). by : (n, channels, 20), gradients as in `calib.stages.estimator.sensors`.
     """
 
     span: IntArray
@@ -116,7 +116,7 @@ def basis_rows(knots: Knots, t_s: FloatArray) -> tuple[IntArray, FloatArray]:
 
 @kernel()
 def states_of(span: IntArray, basis: FloatArray, c: FloatArray, sensor: FloatArray) -> FloatArray:
-    """States (n, 19) of coefficients c (count, 2) and `SENSOR` (13,), its time offset already taken."""
+    """States (n, 20) of coefficients c (count, 2) and `SENSOR` (14,), its time offset already taken."""
     states = np.empty((len(span), SIZE))
     for n in range(len(span)):
         for d in range(3):
@@ -164,7 +164,7 @@ def normal_sums(
     span: IntArray, basis: FloatArray, by: FloatArray, weight: FloatArray, A: FloatArray, B: FloatArray,
     C: FloatArray,
 ) -> None:  # fmt: skip
-    """Add weight J J' of all rows to A (12, 2 count), lower banded, B (2 count, 13) and C (13, 13)."""
+    """Add weight J J' of all rows to A (12, 2 count), lower banded, B (2 count, 14) and C (14, 14)."""
     J = np.empty(2 * basis.shape[2])
     for n in range(len(span)):
         first = 2 * span[n]
@@ -193,7 +193,7 @@ def normal_sums(
 def gathered(
     span: IntArray, basis: FloatArray, by: FloatArray, pull: FloatArray, to_c: FloatArray, to_s: FloatArray
 ) -> None:
-    """Add J' pull of all rows, pull (n, channels), to (2 count,) and (13,)."""
+    """Add J' pull of all rows, pull (n, channels), to (2 count,) and (14,)."""
     J = np.empty(2 * basis.shape[2])
     for n in range(len(span)):
         first = 2 * span[n]

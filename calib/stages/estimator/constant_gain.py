@@ -10,7 +10,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.estimator.kinematic import Setup
-from calib.stages.estimator.sensors import GRAVITY_MPS2, marker
+from calib.stages.estimator.sensors import GRAVITY_MPS2, SIZE, marker
 
 # ----------------------------------------------------------------------
 # Gains of the fused estimator: what it runs with, and how they are found.
@@ -176,7 +176,7 @@ def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> 
 
 def tick_noise(setup: Setup) -> TickNoise:
     """Noise of a tick's readings from that of the sensors, at the head's rest."""
-    state, by = np.concatenate([setup.start.head, setup.start.sensor]), np.empty((2, 19))
+    state, by = np.concatenate([setup.start.head, setup.start.sensor]), np.empty((2, SIZE))
     state[2:6] = 0.0
     marker(setup.view, state, by[0], by[1])
     inverse = np.linalg.inv(by[:, :2])

@@ -25,10 +25,12 @@ from calib.stages.estimator.event import (
     IMU,
     TELLING,
     absorb,
+    accel_variance,
     camera_terms,
     chi_squares,
     judge,
     leave,
+    stamp_variance,
     tell,
     update,
 )
@@ -68,7 +70,7 @@ from calib.stages.estimator.smoother import events_of, look_back, smooth, undo_r
 # ----------------------------------------------------------------------
 # The driven process: the actuator's dynamics with the commands of its pumps as input.
 #
-# A state is the row `DRIVEN` of 36 numbers. The first twelve move: angle, length and their rates, creep as z1
+# A state is the row `DRIVEN` of 37 numbers. The first twelve move: angle, length and their rates, creep as z1
 # + z2 and z1 - z2, and for each bellows the output of the pump's lag, its force, and a slow disturbance that
 # is added to it. Then come what is not known exactly of plant and pumps (`PARAMETER`), as relative deviations
 # from the nominal value (of the damping its logarithm, of the rest length metres), and the sensors of
@@ -443,7 +445,7 @@ def carry(P: FloatArray, F: FloatArray, noise: FloatArray, dt: float, w: FloatAr
 
     Parameters
     ----------
-    P : (36, 36). F : (12, 23). noise : (36,) squared densities. w : (`CARRY`,) scratch, for F P and F'.
+    P : (37, 37). F : (12, 23). noise : (37,) squared densities. w : (`CARRY`,) scratch, for F P and F'.
     """
     # Flat arrays with sizes that are known: the compiler takes several columns at a time.
     flat = P.reshape(-1)
@@ -539,7 +541,7 @@ class Drive:
         return noise
 
     def walk(self, setup: Setup) -> FloatArray:
-        """Squared densities (36,) of the walk of the state, and of `walk_switching`."""
+        """Squared densities (37,) of the walk of the state, and of `walk_switching`."""
         moving = np.zeros(DYNAMIC)
         moving[2:4] = self.walk_rates
         moving[4:10] = self.walk_forces
@@ -548,7 +550,7 @@ class Drive:
         return np.concatenate([moving, parameters, setup.process.sensor_walk, [self.walk_switching]]) ** 2
 
     def start(self, setup: Setup) -> tuple[FloatArray, FloatArray]:
-        """State (36,) and covariance (36, 36) before the first reading."""
+        """State (37,) and covariance (37, 37) before the first reading."""
         begin = setup.start
         x, sigma = np.zeros(len(DRIVEN)), np.zeros(len(DRIVEN))
         x[:4], sigma[:4] = begin.head[:4], begin.head_sigma[:4]
@@ -592,7 +594,7 @@ class Switches(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What does not change: start (36,), (36, 36), plant (21,), walk, the camera's view, noise, and numbers.
+    """What does not change: start (37,), (37, 37), plant (21,), walk, the camera's view, noise, and numbers.
 
     Attributes
     ----------
@@ -644,7 +646,6 @@ what is learnt, and F."""
 TRACE = 2 * SIZE_D + 2
 """Length of what a reading leaves; the last number is 0 where there was none."""
 
-_SWING_RADPS = 25.0
 _ALONE = np.ones(1)
 _MOST_DAMPED = 1.1
 """Limit of `log_damping`, three times the damping that is known: a head that is held is not in honey."""
@@ -661,16 +662,16 @@ _SHIFT = INVOLVED - 6
 
 @kernel(arrays=False)
 def _consider(x: FloatArray, P: FloatArray, learnt: FloatArray) -> None:
-    """Which entries of a state (36,) readings change: 1, and 0 for what is considered and not learnt.
+    """Which entries of a state (37,) readings change: 1, and 0 for what is considered and not learnt.
 
-    Considered is the geometry: lever, marker offset, shift and stretch of the plane. So is what multiplies a
-    quantity that may be none: the product of both errors would pass for knowledge. At rest the damping went
-    to seven times its value and the stiffness 30 % up, both sure of it. Of a head that does not move these
-    are damping, mass and creep; stiffness, bending and pumps, too, where no pump holds it.
+    Considered is the geometry: place of the IMU, marker offset, shift and stretch of the plane. So is what
+    multiplies a quantity that may be none: the product of both errors would pass for knowledge. At rest the
+    damping went to seven times its value and the stiffness 30 % up, both sure of it. Of a head that does not
+    move these are damping, mass and creep; stiffness, bending and pumps, too, where no pump holds it.
     """
     for k in range(x.shape[0]):
         learnt[k] = 1.0
-    learnt[28], learnt[29], learnt[31], learnt[32], learnt[33] = 0.0, 0.0, 0.0, 0.0, 0.0
+    learnt[28], learnt[29], learnt[31], learnt[32], learnt[33], learnt[36] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if x[2] * x[2] > TELLING * P[2, 2] or x[3] * x[3] > TELLING * P[3, 3]:
         return
     learnt[13], learnt[20], learnt[21], learnt[22] = 0.0, 0.0, 0.0, 0.0
@@ -770,7 +771,7 @@ def predict_driven(
 
 @kernel(arrays=False)
 def _spread_out(h: FloatArray, H: FloatArray) -> None:
-    """A gradient (19,) by head and sensors as one by the driven state; accelerations are left out."""
+    """A gradient (20,) by head and sensors as one by the driven state; accelerations are left out."""
     for k in range(4, INVOLVED):
         H[k] = 0.0
     for k in range(4):
@@ -784,7 +785,7 @@ def measure(
     kind: int, x: FloatArray, P: FloatArray, model: Model, stamp: float, H: FloatArray, out: FloatArray,
     work: FloatArray,
 ) -> None:  # fmt: skip
-    """Predicted readings out[0:3] and variances of their noise out[3:6]; H (3, 36) gets the gradients.
+    """Predicted readings out[0:3] and variances of their noise out[3:6]; H (3, 37) gets the gradients.
 
     `stamp` is the variance [s^2] of the event's time: what moves fast is not read where it was.
     """
@@ -805,10 +806,7 @@ def measure(
     tilt = x[0] + x[26]
     moved_x = out[0] - x[24] - GRAVITY_MPS2 * math.cos(tilt)
     moved_y = out[1] - x[25] - GRAVITY_MPS2 * math.sin(tilt)
-    moved = moved_x * moved_x + moved_y * moved_y
-    # Of a swing at _SWING_RADPS the acceleration changes by so much in a second.
-    turning = GRAVITY_MPS2 * GRAVITY_MPS2 * x[2] * x[2] + _SWING_RADPS * _SWING_RADPS * moved
-    scale = noise[5] * noise[5] * moved + stamp * turning
+    scale = accel_variance(noise, stamp, x[2], moved_x * moved_x + moved_y * moved_y)
     for k in range(2):
         _spread_out(h[k], H[k])
         for i in range(INVOLVED):
@@ -842,7 +840,7 @@ def driven_event(
         for k in range(report.shape[0]):
             report[k] = math.nan
     log_l, noise = 0.0, model.noise
-    stamp = max(noise[6 if kind == CAMERA else 7] ** 2, z[3])
+    stamp = stamp_variance(kind, noise, z)
     H, p, out, e = work[2:5], work[0], work[5], work[10]
     learnt = work[24]
     _consider(x, P, learnt)
@@ -868,7 +866,7 @@ def driven_event(
     report[11] = log_l
 
 
-assert SIZE_D == 36
+assert SIZE_D == 37
 
 
 # ----------------------------------------------------------------------
@@ -918,7 +916,7 @@ def write_row(x: FloatArray, P: FloatArray, dt: float, radius: float, out: Float
 def begin_again(
     x: FloatArray, P: FloatArray, model: Model, z: FloatArray, again: bool, driven: bool, g: FloatArray
 ) -> bool:
-    """Start a state (36,) from its prior and a picture z; what has been learnt may be wrong and goes.
+    """Start a state (37,) from its prior and a picture z; what has been learnt may be wrong and goes.
 
     A log begins at rest. In its middle, `again`, the forces may be anything: those of the pumps, most likely
     the static ones of the last command, g (4,), or where nothing was `driven` yet those of a hand. The hoses
@@ -1280,7 +1278,7 @@ class DrivenFilter:
         self.setup, self.drive = setup, drive
         self._held = np.zeros((2, 2))
         size, n = setup.ring, len(DRIVEN)
-        self._events = no_events(size, 4, np.full(size, np.nan))
+        self._events = no_events(size, np.full(size, np.nan))
         self._memory = Memory(
             np.zeros((size, n)), np.zeros((size, n, n)), np.zeros(6, dtype=np.int64), np.full(5, np.nan),
             Switches(np.full(_SWITCHES, -np.inf), np.zeros((_SWITCHES, 4))),
@@ -1306,12 +1304,12 @@ class DrivenFilter:
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """State (36,) and covariance (36, 36) after the last event."""
+        """State (37,) and covariance (37, 37) after the last event."""
         here = int(self._memory.whole[NEWEST])
         return self._memory.x[here].copy(), self._memory.P[here].copy()
 
 
-assert SIZE == 19
+assert SIZE == 20
 
 
 # ----------------------------------------------------------------------

@@ -49,6 +49,26 @@ _MARGIN_PX2 = 0.25
 """Added to the variance for gating: half a pixel of motion that no level expects is no outlier."""
 
 
+_SWING_RADPS = 25.0
+
+
+@kernel(arrays=False, inlined=True)
+def stamp_variance(kind: int, noise: FloatArray, z: FloatArray) -> float:
+    """Variance [s^2] of an event's time: that of its clock z[3], at least what is usual."""
+    return float(max(noise[6 if kind == CAMERA else 7] ** 2, z[3]))
+
+
+@kernel(arrays=False, inlined=True)
+def accel_variance(noise: FloatArray, stamp: float, rate: float, moved: float) -> float:
+    """Variance of what is felt of a head that turns at a rate and is `moved` [m^2/s^4], squared.
+
+    Errors of scale are a share of that. In a swing at `_SWING_RADPS` it changes in a second by as many times
+    itself, and gravity turns by the rate.
+    """
+    turning = GRAVITY_MPS2 * GRAVITY_MPS2 * rate * rate + _SWING_RADPS * _SWING_RADPS * moved
+    return float(noise[5] * noise[5] * moved + stamp * turning)
+
+
 @kernel(arrays=False)
 def camera_terms(
     view: FloatArray, noise: FloatArray, stamp: float, x: FloatArray, P: FloatArray, H: FloatArray,
@@ -58,7 +78,7 @@ def camera_terms(
 
     Parameters
     ----------
-    stamp : variance [s^2] of the picture's time. x : (19,) of head and sensors. H : (2, 19) or more rows,
+    stamp : variance [s^2] of the picture's time. x : (20,) of head and sensors. H : (2, 20) or more rows,
         gets the gradients. P : covariance of a state whose rates are at 2 and 3.
     """
     out[0], out[1] = marker(view, x, H[0], H[1])
@@ -70,8 +90,12 @@ def camera_terms(
 
 
 @kernel(arrays=False)
-def imu_terms(noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray) -> None:
-    """Predicted a_x, a_y, g_z and variances of their noise, for a state (19,) that holds its accelerations.
+def imu_terms(
+    noise: FloatArray, stamp: float, x: FloatArray, P: FloatArray, H: FloatArray, out: FloatArray
+) -> None:
+    """Predicted a_x, a_y, g_z and variances of their noise, for a state (20,) that holds its accelerations.
+
+    `stamp` is the variance [s^2] of the sample's time.
 
     Length and lever act on the accelerometer through ddphi, which is estimated from the same readings; errors
     in what multiplies them would pass for knowledge and pull the length by a millimetre at rest. So they go
@@ -84,12 +108,12 @@ def imu_terms(noise: FloatArray, x: FloatArray, P: FloatArray, H: FloatArray, ou
     tilt = x[0] + x[9]
     moved_x = out[0] - x[7] - GRAVITY_MPS2 * math.cos(tilt)
     moved_y = out[1] - x[8] - GRAVITY_MPS2 * math.sin(tilt)
-    scale = noise[5] * noise[5] * (moved_x * moved_x + moved_y * moved_y)
+    scale = accel_variance(noise, stamp, x[2], moved_x * moved_x + moved_y * moved_y)
     for k in range(2):
         unknown = H[k, 1] * H[k, 1] * P[1, 1] + H[k, 11] * H[k, 11] * P[11, 11]
         out[3 + k] = noise[2 + k] * noise[2 + k] + scale + unknown
         H[k, 1], H[k, 11] = 0.0, 0.0
-    out[5] = noise[4] * noise[4] + (x[4] * noise[7]) ** 2
+    out[5] = noise[4] * noise[4] + x[4] * x[4] * stamp
 
 
 @kernel(arrays=False, inlined=True)

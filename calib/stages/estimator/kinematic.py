@@ -20,6 +20,7 @@ from calib.stages.estimator.event import (
     chi_squares,
     imu_terms,
     judge,
+    stamp_variance,
     tell,
     update,
 )
@@ -95,7 +96,7 @@ class Kinematic:
     ----------
     levels : the bank.
     switch_hz : rate at which one level turns into another.
-    sensor_walk : (13,) densities of the walk of `sensors.SENSOR`, unit per sqrt(s).
+    sensor_walk : (14,) densities of the walk of `sensors.SENSOR`, unit per sqrt(s).
     """
 
     levels: tuple[Level, ...] = LEVELS
@@ -103,7 +104,7 @@ class Kinematic:
     sensor_walk: tuple[float, ...] = tuple(one.walk for one in QUANTITIES.values())
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
-        """Levels (M, 8) and squared walks (13,) for the compiled functions."""
+        """Levels (M, 8) and squared walks (14,) for the compiled functions."""
         return np.array([level.numbers() for level in self.levels]), np.array(self.sensor_walk) ** 2
 
 
@@ -136,8 +137,8 @@ def axis_noise(q: float, walk: float, h: float) -> tuple[float, float, float, fl
 
 
 # ----------------------------------------------------------------------
-# The bank: states (slots, M, 24) and covariances (slots, M, 19, 24) of its M levels, carried on and mixed. A
-# slot holds the levels of one moment. Of the 24 places of a row 19 are used and the rest are zero: whole
+# The bank: states (slots, M, 24) and covariances (slots, M, 20, 24) of its M levels, carried on and mixed. A
+# slot holds the levels of one moment. Of the 24 places of a row 20 are used and the rest are zero: whole
 # registers take half the time.
 
 WIDTH = 24
@@ -149,7 +150,7 @@ _NEGLIGIBLE = 1e-6
 def banked(
     x: FloatArray, P: FloatArray, w: FloatArray, slots: int = 2
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A bank whose slots all hold states (M, 19), covariances and weights, and its weights (slots, M + 1)."""
+    """A bank whose slots all hold states (M, 20), covariances and weights, and its weights (slots, M + 1)."""
     wide_x, wide_P = np.zeros((slots, len(x), WIDTH)), np.zeros((slots, len(x), SIZE, WIDTH))
     wide_x[:, :, :SIZE], wide_P[..., :SIZE] = x, P
     return wide_x, wide_P, np.tile(np.append(w, 0.0), (slots, 1))
@@ -201,11 +202,11 @@ def _step(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, h: 
 
 @kernel(arrays=False)
 def predict(x: FloatArray, P: FloatArray, level: FloatArray, walk: FloatArray, dt: float) -> None:
-    """Carry a state (19,) and its covariance on by dt >= 0 [s], in place.
+    """Carry a state (20,) and its covariance on by dt >= 0 [s], in place.
 
     Parameters
     ----------
-    level : (8,) row of `Kinematic.arrays`. walk : (13,) squared densities of the sensors' walk.
+    level : (8,) row of `Kinematic.arrays`. walk : (14,) squared densities of the sensors' walk.
     """
     if not dt > 0.0:
         return
@@ -299,16 +300,21 @@ def settle_weights(weights: FloatArray, slot: int, log_likelihood: FloatArray, p
 # the sample before. A Kalman filter on (time of this sample, period) with a period that wanders a little is a
 # line fitted with forgetting: its gains fall as in a fit of a line and end at about one in a hundred.
 #
-# A stamp that comes a number of periods late says that samples are missing, and they are counted. One
-# that is off by less, or early, is not believed; the sample gets the time that was due. When ten in
-# a row are not believed the clock starts again from the stamp, as it does where time jumps.
+# A stamp that comes a number of periods late says that samples are missing, and they are counted where that
+# is likelier than jitter by what a missing sample is rarer; each late stamp in a row adds its evidence. One
+# is taken back where the next stamp is early by as much. A stamp that is off by less, or early, is not
+# believed; the sample gets the time that was due. When ten in a row are not believed the clock starts again
+# from the stamp, as it does where time jumps.
 
-CLOCK_SIZE = 10
-"""Entries: running, time, period, P_tt, P_tT, P_TT, jitter variance, unbelieved in a row, nominal, count."""
+CLOCK_SIZE = 11
+"""Entries: running, time, period, P_tt, P_tT, P_TT, jitter variance, unbelieved in a row, nominal, count, and
+how many samples were last counted as missing, until a stamp is believed again."""
 
 _WANDER = 2e-6
 _JITTER_S = 5e-4
 _GATE = 5.0
+_RARE = 7.0
+"""Logarithm of how much rarer a missing sample is than one that is there."""
 _MOST_MISTRUST = 10
 
 
@@ -342,16 +348,20 @@ def advance(clock: FloatArray, stamp: float) -> float:
     time = clock[1] + T
     steps = 1.0
     error = stamp - time
-    if error > 0.5 * T:
-        missed = math.floor(error / T + 0.5)
+    recently, clock[10] = clock[10], 0.0
+    if error > 0.5 * T or (recently > 0.0 and error < -0.5 * T):
+        missed = math.floor(error / T + 0.5) if error > 0.0 else -1.0
         # A period is not known well enough to count over a long gap.
         if missed * math.sqrt(clock[5]) > 0.1 * T:
             return float(advance_again(clock, stamp))
+        left, spread = error - missed * T, clock[3] + clock[6]
         # Only where the stamp then fits: a sample that waited half a period is late, none is missing.
-        if abs(error - missed * T) < _GATE * math.sqrt(clock[3] + clock[6]) + 0.01 * T:
+        fits = abs(left) < _GATE * math.sqrt(spread) + 0.01 * T
+        if fits and error * error - left * left > 2.0 * spread * _RARE / (1.0 + clock[7]):
             steps += missed
             time += missed * T
-            error -= missed * T
+            error = left
+            clock[10] = max(missed, 0.0)
     wander = (_WANDER * nominal) ** 2 * steps
     tt = clock[3] + 2.0 * steps * clock[4] + steps * steps * clock[5]
     tT = clock[4] + steps * clock[5]
@@ -360,7 +370,7 @@ def advance(clock: FloatArray, stamp: float) -> float:
     clock[1], clock[3], clock[4], clock[5] = time, tt, tT, TT
     clock[9] += 1.0
     if abs(error) > min(limit, 0.45 * nominal):
-        clock[7] += 1.0
+        clock[7], clock[10] = clock[7] + 1.0, recently
         if clock[7] >= _MOST_MISTRUST:
             return float(advance_again(clock, stamp))
         return float(time)
@@ -401,7 +411,7 @@ def even_times(clock: FloatArray, stamps: FloatArray) -> tuple[FloatArray, Float
 # alignment say of the geometry (lever, marker offset, shift and stretch of the plane) is considered and not
 # learnt: a single log does not change it.
 
-CONSIDERED = (11, 12, 14, 15, 16)
+CONSIDERED = (11, 12, 14, 15, 16, 19)
 """Entries of the state that readings do not change."""
 
 _LEARNT = np.array([0.0 if k in CONSIDERED else 1.0 for k in range(WIDTH)])
@@ -435,7 +445,8 @@ def bank_event(
     ----------
     bank_x, bank_P : of which slot `old` is read and `new` written; of one level they may be the same.
     weights : (slots, M + 1) weights of the levels, and the time since they were last mixed [s].
-    kind, z, dt : `CAMERA`, `IMU` or 0 for none; (3,) readings; time since the event before [s].
+    kind, z, dt : `CAMERA`, `IMU` or 0 for none; (4,) readings and variance of their time [s^2]; time since
+        the event before [s].
     switch_hz, levels, walk : of `Kinematic`, (M, 8) levels.
     view, noise : camera (25,), `NOISE` (11,).
     work, told : (M, *`WORK`) and (M, 7) scratch.
@@ -459,14 +470,14 @@ def bank_event(
     report[11] = 0.0
     for k in range(trace.shape[0]):
         trace[k, TRACE - 1] = 0.0
-    stamp = noise[6] * noise[6]
+    stamp = stamp_variance(kind, noise, z)
     for m in range(count):
         x, P, out = bank_x[new, m], bank_P[new, m], work[m, 3]
         predict(x, P, levels[m], walk, dt)
         if kind == CAMERA:
             camera_terms(view, noise, stamp, x, P, work[m], out)
         elif kind == IMU:
-            imu_terms(noise, x, P, work[m], out)
+            imu_terms(noise, stamp, x, P, work[m], out)
         if kind != 0:
             chi_squares(
                 kind, P, work[m], z, out, noise, work[m, 4], work[m, 5:8], work[m, 8:], told[m], int(WIDTH)
@@ -516,8 +527,8 @@ class Start:
     Attributes
     ----------
     head, head_sigma : (6,) of `sensors.HEAD`.
-    sensor, sensor_sigma : (13,) of `sensors.SENSOR`.
-    sensor_covariance : (13, 13) in place of the deviations, where the quantities are not independent.
+    sensor, sensor_sigma : (14,) of `sensors.SENSOR`.
+    sensor_covariance : (14, 14) in place of the deviations, where the quantities are not independent.
     """
 
     sensor: FloatArray
@@ -527,7 +538,7 @@ class Start:
     sensor_covariance: FloatArray | None = None
 
     def covariance(self) -> FloatArray:
-        """Covariance (19, 19) of head and sensors."""
+        """Covariance (20, 20) of head and sensors."""
         P = np.diag(np.concatenate([self.head_sigma, self.sensor_sigma]) ** 2)
         if self.sensor_covariance is not None:
             P[6:, 6:] = self.sensor_covariance
@@ -631,7 +642,7 @@ def finish_row(
 
 
 class Bank(NamedTuple):
-    """States (slots, M, 19), covariances and weights (slots, M + 1) of the levels, as in `bank_event`."""
+    """States (slots, M, 20), covariances and weights (slots, M + 1) of the levels, as in `bank_event`."""
 
     x: FloatArray
     P: FloatArray
@@ -754,7 +765,7 @@ def _place_head(bank: Bank, slot: int, phi: float, length: float) -> None:
 
 @kernel(arrays=False)
 def _hold(x: FloatArray, P: FloatArray, k: int, middle: float, sigma: float, p: FloatArray) -> None:
-    """Use the prior of one quantity of the head as a reading; p (19,) is scratch."""
+    """Use the prior of one quantity of the head as a reading; p (20,) is scratch."""
     for j in range(p.shape[0]):
         p[j] = P[k, j]
     update(x, P, middle - x[k], P[k, k] + sigma * sigma, p, _ALL)
@@ -797,7 +808,7 @@ class Events(NamedTuple):
 
     Attributes
     ----------
-    t : (size,) times [s]. z : (size, k) readings. kind : (size,). gated : (size, 3) as in `bank_event`.
+    t : (size,) times [s]. z, gated : (size, 4) and (size, 3) as in `bank_event`. kind : (size,).
     let_go : (size,) time before it at which the head was let go, NaN for none; or empty.
     """
 
@@ -808,11 +819,11 @@ class Events(NamedTuple):
     let_go: FloatArray
 
 
-def no_events(size: int, readings: int, let_go: FloatArray) -> Events:
+def no_events(size: int, let_go: FloatArray) -> Events:
     """A ring of this size without events."""
     return Events(
         np.zeros(size),
-        np.zeros((size, readings)),
+        np.zeros((size, 4)),
         np.zeros(size, dtype=np.int64),
         np.zeros((size, 3)),
         let_go,
@@ -971,7 +982,7 @@ def run_filter(
     """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT))."""
     whole, real, size, count = memory.whole, memory.real, events.t.shape[0], model.levels.shape[0]
     head, head_sigma, report = model.head, model.head_sigma, room.report
-    z0 = z1 = z2 = 0.0
+    z0 = z1 = z2 = late2 = 0.0
     for row in range(len(t)):
         stamp, flags = t[row], 0
         if begin_row(stamp, real[_LAST], memory.camera_clock, memory.imu_clock, out, row):
@@ -987,13 +998,13 @@ def run_filter(
             if not kinds[row] & kind:
                 continue
             if kind == CAMERA:
-                when = advance(memory.camera_clock, stamp) - model.delay
+                when, late2 = advance(memory.camera_clock, stamp) - model.delay, memory.camera_clock[3]
                 z0, z1, z2 = readings[row, 0], readings[row, 1], math.nan
                 if math.isnan(z0) or math.isnan(z1):
                     continue
                 real[_CAMERA_SEEN] = stamp
             else:
-                when = advance(memory.imu_clock, stamp)
+                when, late2 = advance(memory.imu_clock, stamp), memory.imu_clock[3]
                 z0, z1, z2 = readings[row, 2], readings[row, 3], readings[row, 4]
                 if math.isnan(z2) and (math.isnan(z0) or math.isnan(z1)):
                     continue
@@ -1010,7 +1021,7 @@ def run_filter(
                 flags |= 16
                 continue
             own = (newest + 1 - back) % size
-            events.z[own, 0], events.z[own, 1], events.z[own, 2] = z0, z1, z2
+            events.z[own, 0], events.z[own, 1], events.z[own, 2], events.z[own, 3] = z0, z1, z2, late2
             if kind == CAMERA and (whole[_CAMERA_STARTED] == 0 or whole[_PENDING] == 1):
                 flags |= _begin_at(z0, z1, bank, (own - 1) % size, memory, model)
             for i in range(back + 1):
@@ -1041,7 +1052,7 @@ def run_filter(
 
 
 def starting_state(setup: Setup, rows: Rows | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """State (M, 19), covariance and weights before the first reading.
+    """State (M, 20), covariance and weights before the first reading.
 
     Parameters
     ----------
@@ -1069,7 +1080,7 @@ class Filter:
         start, size = setup.start, setup.ring
         # One slot more than the ring has, for what is only looked ahead.
         self._bank = Bank(*banked(*starting_state(setup), size + 1))
-        self._events = no_events(size, 3, np.empty(0))
+        self._events = no_events(size, np.empty(0))
         self._memory = _Memory(
             np.zeros(4, dtype=np.int64), np.full(5, np.nan), new_clock(setup.camera_period_s),
             new_clock(setup.imu_period_s),
@@ -1094,16 +1105,16 @@ class Filter:
 
     @property
     def sensor(self) -> FloatArray:
-        """What the log has come to say of `sensors.SENSOR` (13,), as in `starting_state`."""
+        """What the log has come to say of `sensors.SENSOR` (14,), as in `starting_state`."""
         x, _, weights = self.state
         return np.asarray(weights @ x[:, 6:])
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """State (M, 19), covariance (M, 19, 19) and weights (M,) after the last event."""
+        """State (M, 20), covariance (M, 20, 20) and weights (M,) after the last event."""
         here, count = int(self._memory.whole[NEWEST]), len(self._model.levels)
         x, P = self._bank.x[here, :, :SIZE], self._bank.P[here, :, :, :SIZE]
         return x.copy(), P.copy(), self._bank.weights[here, :count].copy()
 
 
-assert CLOCK_SIZE == 10
+assert CLOCK_SIZE == 11

@@ -168,7 +168,8 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
         name: max(one, 1e-9) if isinstance(one := deviations.get(name), float) else values[name][1]
         for name in SENSOR
     }
-    values = {name: (found[name], sigmas[name]) for name in SENSOR}
+    usual = {name: values[name][0] for name in SENSOR}
+    values = {name: (usual[name] if found[name] is None else found[name], sigmas[name]) for name in SENSOR}
     covariance = (
         None if align.covariance is None else _covariance(align.covariance, sigmas, _between_logs(rig))
     )
@@ -202,7 +203,7 @@ def _by_quantity(by_key: Mapping[str, Any]) -> dict[str, Any]:
 def _covariance(
     table: CovarianceTable, sigmas: Mapping[str, float], between: Mapping[str, float]
 ) -> FloatArray:
-    """Covariance (13, 13) of `sensors.SENSOR`, with what differs between logs added; those that the table
+    """Covariance (14, 14) of `sensors.SENSOR`, with what differs between logs added; those that the table
     lacks stand alone.
     """
     V = np.diag([sigmas[name] ** 2 for name in SENSOR])

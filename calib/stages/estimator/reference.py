@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.stages.estimator.event import CAMERA, camera_terms, imu_terms
+from calib.stages.estimator.event import CAMERA, camera_terms, imu_terms, stamp_variance
 from calib.stages.estimator.kinematic import (
     CONSIDERED,
     LARGEST_STEP_S,
@@ -30,7 +30,7 @@ from calib.stages.estimator.smoother import Events, events_of, one_level, transi
 
 
 def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
-    """Q (19, 19) over dt [s], steps of more than `kinematic.LARGEST_STEP_S` in parts."""
+    """Q (20, 20) over dt [s], steps of more than `kinematic.LARGEST_STEP_S` in parts."""
     Q, F, part = np.zeros((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.zeros((SIZE, SIZE))
     if not dt > 0.0:
         return Q
@@ -53,14 +53,14 @@ def scalar_readings(
     noise, out = setup.noise, np.empty(SIZE)
     H = np.empty((3, SIZE))
     if kind == CAMERA:
-        camera_terms(setup.view, noise, noise[6] ** 2, x, P, H, out)
+        camera_terms(setup.view, noise, stamp_variance(kind, noise, z), x, P, H, out)
         return [(z[k], out[k], H[k].copy(), out[3 + k], True) for k in range(2)]
-    imu_terms(noise, x, P, H, out)
+    imu_terms(noise, stamp_variance(kind, noise, z), x, P, H, out)
     return [(z[k], out[k], H[k].copy(), out[3 + k], False) for k in (2, 0, 1) if not math.isnan(z[k])]
 
 
 def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """States (n, 19) and covariances (n, 19, 19) after each event, by filterpy's EKF.
+    """States (n, 20) and covariances (n, 20, 20) after each event, by filterpy's EKF.
 
     Parameters
     ----------

@@ -308,7 +308,7 @@ def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
 @dataclass(frozen=True)
 class Smoothed:
     """Rows of `OUT` of a whole log by the filter and by the smoother, the truth (n, 3), and what the filter
-    has come to say of the sensors (13,)."""
+    has come to say of the sensors (14,)."""
 
     filtered: FloatArray
     out: FloatArray
@@ -545,7 +545,7 @@ def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterat
 
     Parameters
     ----------
-    sensor : (13,) of `Filter.sensor`. duration_s : of the log.
+    sensor : (14,) of `Filter.sensor`. duration_s : of the log.
     """
     (before, *_), (P, *_), _ = starting_state(setup)
     walk = np.square(setup.process.sensor_walk) * max(duration_s, 0.0)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
 Gain = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)]
+# The length of a late and precise picture is corrected by more than its residual, which its rate shares.
+LateGain = Annotated[float, Field(gt=0, lt=2, allow_inf_nan=False, strict=True)]
 
 
 class EstimatorLevel(Section):
@@ -43,7 +45,7 @@ class EstimatorGain(Section):
     camera_phi: Gain
     accel_phi: Gain
     bias: Gain
-    moving_length: Gain
+    moving_length: LateGain
     moving_rate: Gain
     rest_length: Gain
     rate_decay: Gain

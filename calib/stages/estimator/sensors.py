@@ -100,7 +100,7 @@ def update_terms(innovation: float, spread: float, jitter: float, grid: float) -
 # What camera, accelerometer and gyroscope read on a moving head, with analytic gradients.
 #
 # The head's motion is given by phi, l and their first and second derivatives, see `HEAD`, the sensors
-# by the quantities of `SENSOR`; a gradient has one entry for each of them in this order, 19 in all.
+# by the quantities of `SENSOR`; a gradient has one entry for each of them in this order, 20 in all.
 #
 # Marker. Constant curvature puts the marker, d along the head's tangent (A.1), at
 #
@@ -116,9 +116,9 @@ def update_terms(innovation: float, spread: float, jitter: float, grid: float) -
 #     r = rho'' - rho dphi^2 / 4,   x = rho ddphi / 2 + rho' dphi
 #
 # along and across the chord the head accelerates by A_t = r cos h + x sin h along its tangent and by
-# A_n = -r sin h + x cos h across it. At the lever c along the tangent, with gravity g,
+# A_n = -r sin h + x cos h across it. At the place c along the tangent and e across it, with gravity g,
 #
-#     f_x = g cos phi - A_t + dphi^2 c,   f_y = g sin phi + A_n + ddphi c
+#     f_x = g cos phi - A_t + dphi^2 c + ddphi e,   f_y = g sin phi + A_n + ddphi c - dphi^2 e
 #
 # is the specific force a - g in the IMU's axes, x towards the base. Mounted at the angle alpha it reads
 #
@@ -167,9 +167,10 @@ QUANTITIES = {
     "stretch": Quantity("the plane's stretch", 0.0, 1e-3, 1e-3, 1e-6),
     "accel_scale_x": Quantity("the accelerometer's scale along x", 0.0, 0.01, 0.003, 1e-6),
     "accel_scale_y": Quantity("the accelerometer's scale along y", 0.0, 0.01, 0.003, 1e-6),
+    "imu_across_m": Quantity("the IMU's place across the head", 0.0, 0.01, 0.001, 1e-7),
 }
 SENSOR = tuple(QUANTITIES)
-"""What the sensors are: entries 6 to 18. The lever is that along the tangent."""
+"""What the sensors are: entries 6 to 19. The lever is that along the tangent."""
 
 SIZE = len(HEAD) + len(SENSOR)
 
@@ -216,7 +217,7 @@ def view_coefficients(
 
 
 def sensor_values(values: dict[str, float]) -> FloatArray:
-    """The (13,) vector of `SENSOR` with these values, zero where none is given."""
+    """The (14,) vector of `SENSOR` with these values, zero where none is given."""
     return np.array([values.get(name, 0.0) for name in SENSOR], dtype=np.float64)
 
 
@@ -342,8 +343,8 @@ def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArr
     Parameters
     ----------
     view : (25,) of `view_coefficients`.
-    state : (19,) of `HEAD` and `SENSOR`.
-    by_u, by_v : (19,) gradients, written to.
+    state : (20,) of `HEAD` and `SENSOR`.
+    by_u, by_v : (20,) gradients, written to.
     """
     late = state[13]
     found = marker_terms(
@@ -369,15 +370,16 @@ def marker(view: FloatArray, state: FloatArray, by_u: FloatArray, by_v: FloatArr
 
 @kernel(arrays=False)
 def accelerometer_terms(
-    phi: float, length: float, dphi: float, dl: float, ddphi: float, ddl: float, alpha: float, lever: float
+    phi: float, length: float, dphi: float, dl: float, ddphi: float, ddl: float, alpha: float, lever: float,
+    across: float,
 ) -> tuple[float, ...]:  # fmt: skip
     """Specific force of the mounted IMU without biases and scales, that at rest, and pairs of derivatives.
 
-    Those by phi, l, dphi, dl, ddphi, ddl and the lever; that by alpha is (-a_y, a_x).
+    Those by phi, l, dphi, dl, ddphi, ddl, the lever and `across`; that by alpha is (-a_y, a_x).
 
     Parameters
     ----------
-    phi .. ddl : motion of the head. alpha, lever : mount angle and the lever along the tangent.
+    phi .. ddl : motion of the head. alpha : mount angle. lever, across : place along the tangent and across.
     """
     gravity = GRAVITY_MPS2
     w = phi * phi
@@ -398,15 +400,15 @@ def accelerometer_terms(
     r_dl, x_dl = 2.0 * S1 * dphi, S * dphi
     r_ddphi, x_ddphi = length * S1, 0.5 * rho
     A_t, A_n = r * ch + x * sh, x * ch - r * sh
-    f_x = gravity * c - A_t + spin2 * lever
-    f_y = gravity * s + A_n + ddphi * lever
+    f_x = gravity * c - A_t + spin2 * lever + ddphi * across
+    f_y = gravity * s + A_n + ddphi * lever - spin2 * across
     x0 = -gravity * s - (r_phi * ch + x_phi * sh + 0.5 * A_n)
     y0 = gravity * c + (x_phi * ch - r_phi * sh - 0.5 * A_t)
     x1, y1 = -(r_l * ch + x_l * sh), x_l * ch - r_l * sh
     x2 = -(r_dphi * ch + x_dphi * sh) + 2.0 * dphi * lever
-    y2 = x_dphi * ch - r_dphi * sh
+    y2 = x_dphi * ch - r_dphi * sh - 2.0 * dphi * across
     x3, y3 = -(r_dl * ch + x_dl * sh), x_dl * ch - r_dl * sh
-    x4, y4 = -(r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
+    x4, y4 = across - (r_ddphi * ch + x_ddphi * sh), lever + x_ddphi * ch - r_ddphi * sh
     x5, y5 = -S * ch, -S * sh
     ca, sa = math.cos(alpha), math.sin(alpha)
     return (
@@ -415,6 +417,7 @@ def accelerometer_terms(
         ca * x2 - sa * y2, sa * x2 + ca * y2, ca * x3 - sa * y3, sa * x3 + ca * y3,
         ca * x4 - sa * y4, sa * x4 + ca * y4, ca * x5 - sa * y5, sa * x5 + ca * y5,
         ca * spin2 - sa * ddphi, sa * spin2 + ca * ddphi,
+        ca * ddphi + sa * spin2, sa * ddphi - ca * spin2,
     )  # fmt: skip
 
 
@@ -424,11 +427,11 @@ def accelerometer(state: FloatArray, by_x: FloatArray, by_y: FloatArray) -> tupl
 
     Parameters
     ----------
-    state : (19,) of `HEAD` and `SENSOR`.
-    by_x, by_y : (19,) gradients, written to.
+    state : (20,) of `HEAD` and `SENSOR`.
+    by_x, by_y : (20,) gradients, written to.
     """
     found = accelerometer_terms(
-        state[0], state[1], state[2], state[3], state[4], state[5], state[9], state[11]
+        state[0], state[1], state[2], state[3], state[4], state[5], state[9], state[11], state[19]
     )
     grow_x, grow_y = 1.0 + state[17], 1.0 + state[18]
     for k in range(by_x.shape[0]):
@@ -437,6 +440,7 @@ def accelerometer(state: FloatArray, by_x: FloatArray, by_y: FloatArray) -> tupl
     for k in range(6):
         by_x[k], by_y[k] = grow_x * found[4 + 2 * k], grow_y * found[5 + 2 * k]
     by_x[11], by_y[11] = grow_x * found[16], grow_y * found[17]
+    by_x[19], by_y[19] = grow_x * found[18], grow_y * found[19]
     by_x[9], by_y[9] = -grow_x * found[1], grow_y * found[0]
     by_x[7], by_y[8] = 1.0, 1.0
     by_x[17], by_y[18] = found[0], found[1]
@@ -445,7 +449,7 @@ def accelerometer(state: FloatArray, by_x: FloatArray, by_y: FloatArray) -> tupl
 
 @kernel(arrays=False)
 def gyroscope(state: FloatArray, by_z: FloatArray) -> float:
-    """Rotation rate g_z [rad/s] of a state (19,); the gradient (19,) is written to."""
+    """Rotation rate g_z [rad/s] of a state (20,); the gradient (20,) is written to."""
     for k in range(by_z.shape[0]):
         by_z[k] = 0.0
     by_z[2], by_z[6], by_z[10] = -(1.0 + state[10]), 1.0, -state[2]
@@ -454,7 +458,7 @@ def gyroscope(state: FloatArray, by_z: FloatArray) -> float:
 
 @kernel()
 def marker_rows(view: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (n, 2) of the states (n, 19) and their gradients (n, 2, 19)."""
+    """Pixels (n, 2) of the states (n, 20) and their gradients (n, 2, 20)."""
     pixels, by = np.empty((len(states), 2)), np.empty((len(states), 2, states.shape[1]))
     for i in range(len(states)):
         pixels[i, 0], pixels[i, 1] = marker(view, states[i], by[i, 0], by[i, 1])
@@ -472,7 +476,7 @@ def invert_marker(
 
     Parameters
     ----------
-    sensor : (13,) of `SENSOR`.
+    sensor : (14,) of `SENSOR`.
     """
     for _ in range(30):
         at_u, at_v, u_phi, v_phi, u_l, v_l, _, _, _, _, _, _, _, _, _, _ = marker_terms(

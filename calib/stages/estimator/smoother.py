@@ -115,7 +115,7 @@ def forward(
     again : whether `gated` (n, 3) holds; else it is written to.
     kept_weights : (n, M) written to.
     trace : (n, 3, `TRACE`), of the last level, or (1, 0, `TRACE`) for nothing.
-    kept_x, kept_P : (n, a) and (n, a, 19), the last level's first states after each event; or none (0, ...).
+    kept_x, kept_P : (n, a) and (n, a, 20), the last level's first states after each event; or none (0, ...).
     """
     count = weights.shape[1] - 1
     told, report, work = np.zeros((count, 7)), np.empty(12), np.zeros((count, WORK[0], WORK[1]))
@@ -271,7 +271,7 @@ def backward(
     Parameters
     ----------
     level : (n, 8). trace : (n, 3, `TRACE`). wanted : (n,) events whose states are.
-    kept_x, kept_P : (n, a) and (n, a, 19); of kept_P the first a columns become the smoothed covariance.
+    kept_x, kept_P : (n, a) and (n, a, 20); of kept_P the first a columns become the smoothed covariance.
     spread : whether the covariance is wanted; the states do without it.
     """
     n = kept_P.shape[2]
@@ -303,7 +303,7 @@ def backward(
 
 
 def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Starting states (1 + k, 19), what is considered as it is and off by a deviation, and their covariance.
+    """Starting states (1 + k, 20), what is considered as it is and off by a deviation, and their covariance.
 
     The rest follows by its regression on what is considered; k counts the principal directions of that.
     """
@@ -325,7 +325,7 @@ def _given(x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class OneLevel:
-    """One level of process noise over events: what it gated (n, 3), states (n, 19), covariances, trace."""
+    """One level of process noise over events: what it gated (n, 3), states (n, 20), covariances, trace."""
 
     gated: FloatArray
     x: FloatArray

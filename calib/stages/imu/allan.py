@@ -187,15 +187,18 @@ def bounds(variance: FloatArray, freedom: FloatArray) -> tuple[FloatArray, Float
 #   larger z = theta / sigma first, and only where z exceeds `LEAST_Z` with the covariance that holds
 #   without the term. Otherwise the log is too short to support it, and it gets an upper bound;
 # - where the fit begins. Filters in the sensor and coarse steps change the variance at the shortest times.
-#   While the fit is worse than chance would have it once in ten thousand, the shortest time is left out.
+#   While the fit is worse than chance would have it once in ten thousand, the shortest time is left out, and
+#   then two octaves more: what is too little to be seen of noise that a filter has coloured shifted N by 4 to
+#   6 of its deviations, and by one or less without these. Where no start is good the fit has all times.
 
 LEAST_Z = 3.0
 LEAST_SAMPLES = 64
 _ONE_SIDED_95 = 1.6448536269514722
 _WORST_CHANCE = 1e-4
+_MARGIN = 2
 _FEWEST = 4
-_SHORTEST_S = 1.0
-"""The fit begins no later than here, so that what it calls white noise is noise of at least 1 Hz."""
+_SHORTEST_S = 1.5
+"""The first time that fits is no later than here: what is called white is noise of about 1 Hz or more."""
 
 
 @dataclass(frozen=True)
@@ -365,11 +368,16 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
         raise BadInputError("readings: never change, expected noise")
     G = covariance_forms(m_fit, lengths)
     least = min(len(m_fit) - _FEWEST, max(0, math.floor(math.log2(max(_SHORTEST_S / period_s, 1.0)))))
-    first, fit = 0, _select(variance, m_fit, G)
-    for skipped in range(1, least + 1):
-        if fit.chance > _WORST_CHANCE:
-            break
-        first, fit = skipped, _select(variance[skipped:], m_fit[skipped:], G[skipped:, skipped:])
+
+    def since(k: int) -> _Fit:
+        return _select(variance[k:], m_fit[k:], G[k:, k:])
+
+    first, fit = 0, since(0)
+    if fit.chance <= _WORST_CHANCE:
+        start = next((k for k in range(1, least + 1) if since(k).chance > _WORST_CHANCE), 0)
+        # Where none fits it is not the short times that are unlike the model.
+        first = max(start, min(start + _MARGIN, len(m_fit) - _FEWEST)) if start else 0
+        fit = since(first)
     used = (variance[first:], design(m_fit[first:].astype(np.float64)), G[first:, first:])
     root = math.sqrt(period_s)
     units = (root, 1.0, 1.0 / root)

@@ -28,6 +28,7 @@ from calib.stages.imu.sampling import (
     find_rests,
     quiet_level,
     regular_parts,
+    rounding,
     sampling_findings,
     spread,
 )
@@ -387,6 +388,7 @@ class Turns:
     before : (k,) numbers of the rests before, rising; those after follow them.
     rests : all of them.
     gyro_mean, gyro_scatter : (m, 3) mean over each rest, and long-run variance of a reading.
+    rounded : (3,) deviation of a mean by the rounding of the rates.
     initial : number of the rest that the bias is taken from.
     """
 
@@ -398,6 +400,7 @@ class Turns:
     rests: Sequence[Rest]
     gyro_mean: FloatArray
     gyro_scatter: FloatArray
+    rounded: FloatArray
     initial: int
     period_s: float
 
@@ -610,13 +613,15 @@ def fit_bias(turns: Turns, accel: Accelerometer) -> Bias:
         if float(fdtrc(d, dof, F).min()) < _FOLLOWS_POSE and fall < _LEAST_FALL:
             inverse = np.diag(np.linalg.inv(H.T @ H))
             sigma: FloatArray = np.sqrt(np.outer(inverse, left / dof)).astype(np.float64)
+            sigma[0] = np.hypot(sigma[0], turns.rounded)
             wander = np.asarray(np.sqrt(np.maximum(left / dof - white.mean(axis=0), 0.0)))
             return Bias(c[0], sigma[0], c[1:].T, sigma[1:].T, wander)
     excess = about / (n - 1) - white.mean(axis=0) if n > 1 else np.zeros(3)
     # Noise alone exceeds its expectation by chance, too.
     clear = excess > 3.0 * math.sqrt(2.0 / max(n - 1, 1)) * white.mean(axis=0)
     wander = np.asarray(np.sqrt(np.where(clear, excess, 0.0)))
-    return Bias(x[turns.initial], np.sqrt(white[turns.initial] + wander**2), None, None, wander)
+    sigma = np.sqrt(white[turns.initial] + wander**2 + turns.rounded**2)
+    return Bias(x[turns.initial], sigma, None, None, wander)
 
 
 def _rates(turns: Turns, accel: Accelerometer, bias: Bias) -> FloatArray:
@@ -851,6 +856,7 @@ def _turns(
     columns: list[int],
     quiet: Quiet,
     period_s: float,
+    step: FloatArray,
 ) -> tuple[Turns, int]:
     """Turns between rests, and how many could not be used."""
     names = ("gx", "gy", "gz") if len(columns) == 3 else ("gz",)
@@ -867,6 +873,11 @@ def _turns(
             spans.append((offsets[a.part] + a.stop - 1, offsets[a.part] + b.start, i))
     first, last, before = np.array(spans, dtype=np.int64).reshape(-1, 3).T.copy()
     held = [gyro[offsets[rest.part] + rest.start : offsets[rest.part] + rest.stop] for rest in rests]
+    # By differences, which a slow drift does not enter.
+    scatter = np.stack([0.5 * (np.diff(one, axis=0) ** 2).mean(axis=0) for one in held])
+    steps = np.zeros(3)
+    steps[3 - len(names) :] = step[log.places(*names)]
+    typical = np.median(scatter, axis=0)
     turns = Turns(
         gyro=gyro,
         accel=values[:, columns],
@@ -875,8 +886,8 @@ def _turns(
         before=before,
         rests=rests,
         gyro_mean=np.stack([one.mean(axis=0) for one in held]),
-        # By differences, which a slow drift does not enter.
-        gyro_scatter=np.stack([0.5 * (np.diff(one, axis=0) ** 2).mean(axis=0) for one in held]),
+        gyro_scatter=scatter,
+        rounded=np.array([rounding(v, q) for v, q in zip(typical.tolist(), steps.tolist(), strict=True)]),
         initial=0 if quiet.initial_s > 0.0 else int(np.argmax([rest.duration_s for rest in rests])),
         period_s=period_s,
     )
@@ -925,7 +936,7 @@ def find_intrinsics(log: Readings, gravity_mps2: float, planar: bool = False) ->
     gyro, foreign, lost = None, None, 0
     # Directions of an accelerometer that is not told would be blamed on the gyroscope.
     if has_gyro and accel is not None and accel.span >= LEAST_SPAN:
-        turns, lost = _turns(log, parts, rests, columns, quiet, sampling.period_s)
+        turns, lost = _turns(log, parts, rests, columns, quiet, sampling.period_s, sampling.step)
         if len(turns.first):
             gyro_si = "g" not in log.counts
             gyro = fit_gyroscope(turns, accel, gyro_si)

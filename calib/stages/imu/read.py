@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, integral
 from calib.core.errors import BadInputError
 from calib.core.files import as_text, read_bytes, shown
 from calib.core.options import LogOptions
@@ -242,11 +242,10 @@ def _lag(
     k = max(range(len(parts)), key=lambda i: len(parts[i].values))
     part, rate = parts[k], rates[k]
     t = part.t_s
-    own = period_s * np.cumsum(rate)
+    own = integral(t, rate)
     if len(rate) * period_s >= SHORTEST_S + period_s:
         own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk).phi_rad
-    # A rate that holds for the step before its sample is half a step ahead.
-    return lag_of(late_t_s, np.unwrap(late_rad), t, own - 0.5 * period_s * rate)
+    return lag_of(late_t_s, np.unwrap(late_rad), t, own)
 
 
 def tune_log(log: Log, how: Reading) -> TuneLog:

@@ -158,7 +158,7 @@ def sampling_findings(
 def _step(values: FloatArray) -> float:
     """Quantisation step: the least distance of readings, where all are whole multiples of it apart."""
     levels = np.unique(values)
-    if not 3 <= len(levels) <= 0.25 * len(values) + 3:
+    if not 2 <= len(levels) <= 0.25 * len(values) + 3:
         return math.nan
     apart = np.diff(levels)
     digits = 1e-7 * float(np.abs(levels).max())
@@ -167,6 +167,23 @@ def _step(values: FloatArray) -> float:
     if not math.isfinite(least) or float(np.abs(whole - np.rint(whole)).max()) > 0.05:
         return math.nan
     return float((levels[-1] - levels[0]) / np.rint(whole).sum())
+
+
+_HIDDEN = 0.3
+
+
+def rounding(variance: float, step: float) -> float:
+    """Standard deviation of a mean by the rounding of its readings, zero where their noise hides that.
+
+    Readings with less noise than half a step have a mean that depends on where between two steps the signal
+    lies. With v = variance / step^2 it is off, RMS over these places, by 0.25 steps where v is next to
+    nothing, by 0.20 at v = 0.1, by 0.09 at 0.21, by 0.002 at 0.34 and by less than 1e-5 from 0.55 on.
+
+    Parameters
+    ----------
+    variance : of single readings at rest. step : their quantisation step, NaN for none.
+    """
+    return 0.25 * step * math.sqrt(max(1.0 - variance / (_HIDDEN * step**2), 0.0)) if step > 0.0 else 0.0
 
 
 def _at_limit(values: FloatArray, gyro: bool) -> int:

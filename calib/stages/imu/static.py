@@ -22,6 +22,7 @@ from calib.stages.imu.sampling import (
     check_rate,
     regular_parts,
     rest_parts,
+    rounding,
     sampled,
     sampling_findings,
     sensor_findings,
@@ -53,6 +54,8 @@ from calib.stages.imu.section import Imu, ImuLog
 # none; and it matters to an angle.
 
 _STRETCHES = 8
+_UNKNOWN_N = 0.5
+"""Deviation of N, as a share of it, where the noise is less than half a step: by numbers over all places."""
 _MEAN_FLICKER = 2.0 * math.log(2.0) / math.pi
 
 
@@ -112,12 +115,14 @@ class AxisNoise:
     bias : mean over the logs, for an accelerometer with gravity in it.
     sigma : deviation of the bias that is met after the logs, NaN where the axis never changes.
     allan : None where the axis never changes.
+    rounded : what the rounding of readings adds to sigma, zero where their noise is more than half a step.
     """
 
     axis: str
     bias: float
     sigma: float
     allan: Allan | None
+    rounded: float
 
 
 @dataclass(frozen=True)
@@ -239,15 +244,21 @@ def _axis_noise(axis: str, k: int, logs: Sequence[StaticLog], period_s: float) -
     means = np.array([log.mean[k] for log in logs])
     bias = float(means.mean())
     if all(float(np.ptp(column)) == 0.0 for column in columns):
-        return AxisNoise(axis, bias, math.nan, None)
+        return AxisNoise(axis, bias, math.nan, None, 0.0)
     allan = analyse(columns, period_s)
+    # By differences, which a slow drift does not enter.
+    variance = 0.5 * float(np.mean(np.concatenate([np.diff(column) for column in columns]) ** 2))
+    rounded = max(rounding(variance, float(log.sampling.step[k])) for log in logs)
+    if rounded > 0.0:
+        known = replace(allan.N, sigma=max(allan.N.sigma, _UNKNOWN_N * allan.N.value))
+        allan = replace(allan, N=known)
     rest = np.array([log.rest_s for log in logs])
     span = np.array([log.parts[-1].t_s[-1] - log.parts[0].t_s[0] + period_s for log in logs])
     after = allan.theta[0] / rest + _MEAN_FLICKER * allan.theta[1] + allan.walk_within * span / 3.0
     sigma = math.sqrt(float(after.sum())) / len(logs)
     if len(logs) > 1:
         sigma = max(sigma, float(means.std(ddof=1)) / math.sqrt(len(logs)))
-    return AxisNoise(axis, bias, sigma, allan)
+    return AxisNoise(axis, bias, math.hypot(sigma, rounded), allan, rounded)
 
 
 def analyse_static(logs: Sequence[Readings]) -> Static:
@@ -284,11 +295,11 @@ _TILTED_RAD = math.radians(0.3)
 _GRAVITY_MPS2, _MOST_OFF_GRAVITY = 9.81, 0.15
 """Cheap accelerometers are off by a few per cent in scale and some 0.08 g in bias."""
 _COLOURED = 2.0
-"""Deviation over the fitted one from which on the coefficients do not describe the noise."""
+"""Deviation over the fitted one, or this over that, from which on N, B and K do not describe the noise."""
 _LONG_S = 7200.0
 """A log that shows no random walk within this will hardly do so within the next hours."""
 _MOST_REPEATED = 0.02
-_MOST_SIGMA_OF_N = 0.10
+_MOST_SIGMA_OF_N = 0.20
 _LEAST_REST_S = 10.0
 _LEAST_CHANCE = 1e-4
 _SHOWN_MOTIONS = 3
@@ -365,7 +376,14 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
         )
         return
     N = allan.N
-    if not N.sigma <= _MOST_SIGMA_OF_N * N.value:
+    if noise.rounded > 0.0:
+        yield Finding(
+            "poor",
+            f"{axis}: its noise is less than half its step, so that bias and noise depend on where between "
+            "two steps it lies",
+            "set the sensor to a finer range or a wider filter",
+        )
+    elif not N.sigma <= _MOST_SIGMA_OF_N * N.value:
         share = N.sigma / N.value if N.value > 0.0 else math.inf
         yield Finding("poor", f"{axis}: the white noise is known to {share:.0%} only; the log is too short")
     if axis.startswith("g") and N.value < _LEAST_GYRO_NOISE:
@@ -379,16 +397,17 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
         off, tau_s = _colour(allan)
         text = f"{axis}: its noise is coloured, at {tau_s:.2g} s the deviation is {off:.2g} times what white "
         text += "noise, flicker and a random walk explain"
-        if off > _COLOURED:
+        if not 1.0 / _COLOURED <= off <= _COLOURED:
             yield Finding("poor", f"{text}; N, B and K do not describe it")
         else:
             trusts = "far" if off > 1.0 else "little"
             yield Finding("remark", f"{text}; an estimator trusts it by as much too {trusts} there")
-    elif allan.fit_s[0] > 1.5 * float(allan.tau_s[0]):
+    elif allan.fit_s[0] > 1.5 * (tau_s := float(allan.tau_s[0])):
+        off = float(allan.deviation[0] / np.sqrt(model_variance(allan.theta, allan.tau_s[:1]).sum()))
         yield Finding(
             "remark",
-            f"{axis}: below {allan.fit_s[0]:.3g} s the deviation is not that of white noise "
-            "(a filter in the sensor, or its step); the fit begins there",
+            f"{axis}: below {allan.fit_s[0]:.3g} s the deviation is not that of white noise (a filter in the "
+            f"sensor, or its step), at {tau_s:.2g} s {off:.2g} times as large; the fit begins there",
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.special import ndtri, stdtrit
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import FloatArray, IntArray, integral
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
@@ -525,8 +525,7 @@ def smooth_log(
         raise BadInputError(
             f"smoothing: found {t[-1] - t[0]:.3g} s of samples, expected at least {SHORTEST_S:g} s"
         )
-    step = np.diff(t, prepend=t[0])
-    theta = np.cumsum(rate_radps * step)
+    theta = integral(t, rate_radps)
     d = np.unwrap(wrapped(phi_acc_rad - theta))
     offset = float(np.median(d[:20]))
     d = d - offset
@@ -923,7 +922,7 @@ def _robust_size(values: FloatArray) -> float:
 def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> str:
     """How a rate contradicts a reference of its angle; empty where it does not or hardly anything turns."""
     known = np.isfinite(seen_rad)
-    theta = np.cumsum(rate_radps * np.diff(t_s, prepend=t_s[0]))
+    theta = integral(t_s, rate_radps)
     a, b = _level(t_s, np.where(known, theta, np.nan)), _level(t_s, seen_rad)
     kept = np.isfinite(a) & np.isfinite(b)
     a, b = a[kept], b[kept]
@@ -971,7 +970,7 @@ def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> f
     What a lever adds to the accelerometer's angle grows with the angular acceleration, and in a swing
     looks like half a period; it is taken out for each lag that is tried.
     """
-    theta = np.cumsum(rate_radps * np.diff(t_s, prepend=t_s[0]))
+    theta = integral(t_s, rate_radps)
     turning = np.convolve(np.gradient(rate_radps, t_s), np.full(5, 0.2), "same")
     felt = _level(t_s, np.unwrap(phi_acc_rad))
     known = np.isfinite(felt)
@@ -996,8 +995,10 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
     out: dict[str, Finding] = {}
 
     def found(source: str, what: str, severity: Severity = "inconsistent") -> None:
-        text = f"{source}: {what}"
-        out.setdefault(source, Finding(severity, text, "check the columns, signs and units of that log"))
+        advice = "check the columns, signs and units of that log"
+        # A rate that errs alone may be that of a sensor that lies flat.
+        advice += ", and that gravity lies in its x-y plane" if severity == "poor" else ""
+        out.setdefault(source, Finding(severity, f"{source}: {what}", advice))
 
     for piece, own in zip(pieces, result.smoothed, strict=True):
         if piece.reference_rad is not None:

@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x6769964BUL
+#define CALIB_ID 0x4681DE2FUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -119,12 +119,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365900854f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84291003e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599111617f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.92977517e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362183549f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160718486f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365901832f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84293622e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599113107f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.92980281e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362184527f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160719678f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -133,12 +133,12 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00040233f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241059996f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202264544f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216806419f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987321734f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220976561f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.00040495f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241060723f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202263892f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216807183f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987324417f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220976412f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
@@ -149,12 +149,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369099248f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.8204084e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604378819f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21772158e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363201415f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160419777f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.00369100249f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82043605e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.60438031f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21774923e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363202416f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160420969f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
@@ -165,7 +165,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.485934705f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.485803485f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -174,11 +174,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0621161647f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0341886953f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.00327122f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.00599843729f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0188464504f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0619768463f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.034240175f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.00329101f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00599833764f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0188520756f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -192,13 +192,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0165405385f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.92173809e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0165405925f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.92160567e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0150001664f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0150000937f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -220,7 +220,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0649771094f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0649771467f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -234,27 +234,27 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.51406527f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000256233005f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.84545308e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 1.5750551e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.82965424e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000257071195f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -9.08892798e-06f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00251858262f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000256736268f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00827026926f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.96086905e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.373457134f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.26440811f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5288162f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00252472237f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.18796657f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00686179753f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00903857499f /* K_r, dimensionless */
+#define CALIB_FUSED_DELAY_TICKS 1.51419652f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000256202766f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.84642396e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 1.57126979e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.83052645e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000257045962f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -9.10067956e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00251832092f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.00025670958f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00827029627f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.96080283e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.373462975f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.26441383f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5288277f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252472283f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.187968716f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00686185062f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00903865136f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000369752204f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000369749061f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -307,19 +307,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0649771094f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0649771467f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.243759f, 139.741196f, 149.178146f, 157.61525f, 165.529373f,
-    173.173325f, 180.705597f, 188.292282f, 196.100143f, 204.341202f, 213.386246f,
-    224.053955f, 241.448914f, 253.5f,
+    99.75f, 128.243713f, 139.741135f, 149.178055f, 157.615158f, 165.529266f,
+    173.173187f, 180.70546f, 188.292114f, 196.099945f, 204.340973f, 213.385971f,
+    224.053574f, 241.447754f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0449771062f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.114977106f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0449771471f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.114977151f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */

@@ -76,7 +76,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xD6170CEEUL
+#define CALIB_ID 0x233CF997UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -117,12 +117,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365915406f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84328838e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599134326f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93018771e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362198241f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160736367f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365915569f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.84329347e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599134505f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93019208e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362198404f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160736546f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -131,12 +131,12 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00044215f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241070334f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202261657f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216817688f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987361789f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220974311f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.0004425f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241070464f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.020226106f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216817819f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987362206f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220974281f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
@@ -147,12 +147,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.0036911394f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82079403e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604401708f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21814213e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363216223f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160437793f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.00369114103f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82079985e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604401886f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.21814649e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363216386f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160437971f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
@@ -163,7 +163,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.510547459f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.510567307f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -172,11 +172,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0137136048f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0679590479f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.01683724f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.00600619894f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0227973536f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0137160337f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0679628998f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.01683807f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00600617146f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0227976386f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -190,13 +190,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0163875557f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.84269209e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0163875595f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.84264916e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145904562f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145905064f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -218,7 +218,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0651823059f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0651822835f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -232,27 +232,27 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.48945248f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000251091958f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.82162147e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -3.83900806e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.72522458e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000255319668f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.72727687e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00248736376f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000253553881f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00819377787f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.92134604e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.376656383f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.29867506f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5973501f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00252549001f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.18889305f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.0069125439f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00911073945f /* K_r, dimensionless */
+#define CALIB_FUSED_DELAY_TICKS 1.48943269f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000251076563f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.8213418e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -3.8394096e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.72494446e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000255304214f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.72726905e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00248721149f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000253538397f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00819377974f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.92132458e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.376653761f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.29867077f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5973415f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252548489f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.188891172f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00691246474f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00911062583f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.000366810127f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000366814696f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -305,19 +305,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0651823059f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0651822835f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.273651f, 139.784119f, 149.232635f, 157.679276f, 165.602295f,
-    173.257996f, 180.800339f, 188.400833f, 196.224884f, 204.486282f, 213.568436f,
-    224.301727f, 242.203018f, 253.5f,
+    99.75f, 128.273651f, 139.784119f, 149.23262f, 157.67926f, 165.60228f,
+    173.257965f, 180.800308f, 188.400818f, 196.224854f, 204.486237f, 213.56839f,
+    224.301666f, 242.20285f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0451823026f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.115182303f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0451822802f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115182281f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
