@@ -65,7 +65,7 @@ def docs(
         return
     if list_topics and not as_json:
         for one in pages:
-            say(f"  {one.topic:<14}{one.title}")
+            say(f"  {one.topic:<16}{one.title}")
         return
     topics = {one.topic: one.title for one in pages}
     if list_topics:

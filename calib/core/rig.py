@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, Field, field_validator
@@ -99,6 +99,9 @@ class Geometry(Section):
     marker_offset_m: Offset = 0.015
     marker_offset_sigma_m: Annotated[Offset, Field(gt=0.0)] = 5e-5
     """Marker beyond the head along its tangent (A.1), and how well a drawing or a caliper tells it."""
+
+    imu_sign: Annotated[list[Literal[-1, 1]], Field(min_length=3, max_length=3)] | None = None
+    """Signs by which the board multiplies ax, ay and gz as its IMU gives them, of one that is mirrored."""
 
     @field_validator("workspace_m")
     @classmethod

@@ -222,6 +222,7 @@ class Passed:
     ----------
     not_finite : cells that said nan or inf; in Parquet nan is a blank.
     beyond : cells that hold more than any sensor gives. first : the first of them, in words.
+    clipped : readings at the end of their sensor's range. end : the first of them, in words.
     outside : pictures that put the marker outside of them.
     truncated : whether the last line was cut short and left out.
     wraps : how often the counter that is the time began again.
@@ -233,6 +234,8 @@ class Passed:
     truncated: bool = False
     wraps: int = 0
     outside: int = 0
+    clipped: int = 0
+    end: str = ""
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -242,17 +245,23 @@ class Passed:
             self.truncated or later.truncated,
             self.wraps + later.wraps,
             self.outside + later.outside,
+            self.clipped + later.clipped,
+            self.end or later.end,
         )
 
     @property
     def sentences(self) -> list[str]:
         """One for each kind that there is."""
         beyond = f"{self.beyond} cells hold more than any sensor gives ({self.first}) and count as blank"
+        clipped = (
+            f"{self.clipped} readings are at the end of a sensor's range ({self.end}) and count as blank"
+        )
         outside = f"{self.outside} pictures put the marker outside the picture and count as blank"
         return [
             *([f"{self.not_finite} cells say nan or inf and count as blank"] if self.not_finite else []),
             *([beyond] if self.beyond else []),
             *([outside] if self.outside else []),
+            *([clipped] if self.clipped else []),
             *(["the last line is cut short and left out"] if self.truncated else []),
             *(
                 [f"the time is a counter that begins again {self.wraps} times, and is counted on"]
@@ -383,6 +392,7 @@ class ColumnMap:
     source : the log's name for messages. folder : where its columns.yaml is or would be, for messages.
     names : of the file's columns. sources : by column, `t_s` among them.
     evidence : for each kind whose unit the readings tell, how.
+    above : where the table begins, in words, if something else stands above it.
     """
 
     source: str
@@ -390,6 +400,7 @@ class ColumnMap:
     names: tuple[str, ...]
     sources: Mapping[str, Source]
     evidence: Mapping[str, str]
+    above: str = ""
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -408,7 +419,7 @@ class ColumnMap:
             if source.column != column or source.unit != own or source.factor != 1.0 or source.offset:
                 in_unit = f" in {source.unit}" if kind in words else ""
                 groups.setdefault((kind, f"{words.get(kind, column)}{in_unit}"), []).append(source.column)
-        parts = []
+        parts = [self.above] if self.above else []
         for (kind, what), columns in groups.items():
             why = f" ({self.evidence[kind]})" if kind in self.evidence else ""
             parts.append(f"{what} from {', '.join(f'`{one_line(name)[:40]}`' for name in columns)}{why}")

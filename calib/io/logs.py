@@ -32,6 +32,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, is_bag, shown
 from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
@@ -177,6 +178,36 @@ def within(log: Log) -> Log:
             passed += Passed(beyond=len(far), first=first)
             columns[name] = values.copy()
             columns[name][far] = np.nan
+    return log if passed == log.passed else replace(log, columns=columns, passed=passed)
+
+
+_GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 245.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
+_ACCEL_RANGES = tuple(g * GRAVITY_MPS2 for g in (2.0, 4.0, 8.0, 16.0, 32.0))
+_CLIPPED_IN_A_ROW = 3
+
+
+def clipped(values: FloatArray, gyro: bool) -> BoolArray:
+    """Which readings (n,) are at the end of a range that sensors have, where some stay there in a row."""
+    out = np.zeros(len(values), dtype=np.bool_)
+    known = values[np.isfinite(values)]
+    for extreme in (known.max(initial=0.0), known.min(initial=0.0)):
+        ends = _GYRO_RANGES if gyro else _ACCEL_RANGES
+        if any(0.999 * end <= abs(extreme) <= 1.0005 * end for end in ends):
+            held = max((stop - start for start, stop in runs(known == extreme)), default=0)
+            out |= (values == extreme) & (held >= _CLIPPED_IN_A_ROW)
+    return out
+
+
+def unclipped(log: Log) -> Log:
+    """The log with blanks for readings of the IMU at the end of their range: the truth is beyond."""
+    columns, passed = dict(log.columns), log.passed
+    for name in (name for name in IMU if name in columns and log.unit(name) != "counts"):
+        rows = np.flatnonzero(clipped(columns[name], kind_of(name) == "gyro"))
+        if len(rows):
+            end = f"{name} is {columns[name][rows[0]]:.6g} in line {log.lines[rows[0]]}"
+            passed += Passed(clipped=len(rows), end=end)
+            columns[name] = columns[name].copy()
+            columns[name][rows] = np.nan
     return log if passed == log.passed else replace(log, columns=columns, passed=passed)
 
 

@@ -117,6 +117,9 @@ STATES = (
 )  # fmt: skip
 """Columns of the states file."""
 
+BASELINE = ("t_s", "q1_m", "q2_m", "phi_rad", "length_m", "x_m", "y_m")
+"""Columns of what the published pipeline estimates."""
+
 ENDINGS = (".csv", ".parquet", ".mcap")
 """Of the formats; any other ending is written as CSV."""
 
@@ -126,7 +129,8 @@ def _holds_states(path: Path) -> bool:
     if start.startswith(b"\x89MCAP0"):
         # The header names the library.
         return b"calib" in start
-    return column_names(path)[: len(_FIRST)] == _FIRST
+    names = column_names(path)
+    return names[: len(_FIRST)] == _FIRST or names == BASELINE
 
 
 _FIRST = STATES[:6]

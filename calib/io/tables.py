@@ -21,7 +21,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.files import read_bytes, read_text, shown
+from calib.core.files import one_line, read_bytes, read_text, shown
 from calib.core.options import LogOptions
 from calib.core.units import plain_number
 from calib.io.columns import (
@@ -230,6 +230,16 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
     while raw.endswith(b"\n") and (not raw.strip() or raw.lstrip(b"\xef\xbb\xbf").startswith(b"#")):
         comment = raw.decode("utf-8-sig", "replace").lstrip("#% ").rstrip("\r\n") or comment
         line, raw = line + 1, stream.readline(_LONGEST_LINE)
+    ahead, above = b"", ""
+    if not _is_header(raw):
+        first, lines = raw, list(_lines_up_to_a_header(stream))
+        if lines and _is_header(lines[-1]):
+            # What a board or a terminal says before the table.
+            line, raw = line + len(lines), lines[-1]
+            said = one_line(first.decode("utf-8", "replace").strip())[:40]
+            above = f"the table from line {line} on, below `{said}`"
+        else:
+            ahead = b"".join(lines)
     where = f"{source}, line {line}"
     if not raw.strip():
         raise BadInputError(f"{source}: is empty, expected a header and rows")
@@ -251,13 +261,36 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
     if _numeric(names, separator):
         names, rows = _without_header(where, path, names, comment, separator, file), raw
     columns = column_map(source, path, line, names, file, options)
-    start = rows + stream.read(_BLOCK_BYTES)
+    start = rows + ahead + stream.read(_BLOCK_BYTES)
     head = start[: 1 << 14].decode("utf-8", "replace")
     comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
     decimal = (file and file.decimal) or ("," if comma else ".")
     dates = _has_dates(head, columns.names.index(columns.sources["t_s"].column), separator)
+    if above:
+        columns = replace(columns, above=above)
     text = _Text(source, _with_dates(columns) if dates else columns, separator, decimal, dates)
     return text, start, line if rows else line + 1
+
+
+_MOST_ABOVE = 50
+
+
+def _lines_up_to_a_header(stream: BinaryIO) -> Iterator[bytes]:
+    """The next lines, at most so many, up to one that is a header."""
+    for _ in range(_MOST_ABOVE):
+        raw = stream.readline(_LONGEST_LINE)
+        if raw:
+            yield raw
+        if not raw.endswith(b"\n") or _is_header(raw):
+            return
+
+
+def _is_header(raw: bytes) -> bool:
+    """Whether a line names the time and another column."""
+    text = raw.decode("utf-8-sig", "replace").strip()
+    known = [known_name(name.strip().strip('"')) for name in text.split(_separator(text))]
+    found = {one[0] for one in known if one is not None}
+    return "t_s" in found and len(found) > 1
 
 
 def _has_dates(head: str, slot: int, separator: str) -> bool:

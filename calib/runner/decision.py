@@ -149,6 +149,8 @@ def _answer(
     others = [job for job in jobs if job["status"] not in _FINE]
     if others:
         return "with care", f"what the firmware uses is sound, but look at {_titles(others, plain=True)}"
+    if camera_only and "controller" not in sections:
+        return "yes", "camera and plane are calibrated; the header holds them alone, and drives no pumps"
     return "yes", "every stage that had data passed its own quality gate"
 
 

@@ -158,6 +158,13 @@ def _nothing(_: Folder, job: Job) -> Job:
     return job
 
 
+def _control(folder: Folder, job: Job) -> Job:
+    # A rig.yaml may tell of the actuator; without one nothing but these logs does.
+    if folder.rig is None and not _logs(folder, "motion", *_CAMERA, *_PUMP):
+        return job.skipped("no logs with camera and PWM in logs/, and no rig.yaml that tells of the actuator")
+    return job
+
+
 def _replay(_: Folder, job: Job) -> Job:
     log = job.log
     usable = log is not None and (log.has(*_CAMERA) or log.has(*_IMU))
@@ -205,7 +212,7 @@ STEPS: tuple[Step, ...] = (
     # A fit without each log in turn takes as many times as long, and is left to the verb.
     _step("identify logs", _driven, _OPTICS, name="identify", options={"hold_back": False}, seconds=9.0),
     _step("replay", _replay, _OPTICS, each_log=True, output="states.csv", seconds=2.0),
-    _step("control tune", _nothing, name="control", flashed=True, seconds=3.0),
+    _step("control tune", _control, name="control", flashed=True, seconds=3.0),
     _step("validate", _driven, _OPTICS, seconds=8.0),
     _step("firmware", _nothing, output="firmware"),
 )

@@ -2,7 +2,7 @@
 
     python tests/bench/estimator.py
 
-One level of process noise with its 19 states: compiled and on filterpy, the same recursion to 1e-9. Then the
+One level of process noise with its 20 states: compiled and on filterpy, the same recursion to 1e-9. Then the
 whole filter as `calib replay` runs it: clocks, late pictures, gating and a bank of four levels; its time and
 memory over logs of up to 64 times the rows, read in blocks. Times are those of the processor, the least of
 several, so that other work on the machine shows little.
@@ -26,6 +26,7 @@ from estimatorlogs import rows_from, setup_for, simulated
 
 from calib.stages.estimator import reference, smoother
 from calib.stages.estimator.kinematic import TRACE, Filter, Kinematic, Rows, starting_state
+from calib.stages.estimator.sensors import SIZE
 from calib.stages.estimator.smoother import Events
 
 
@@ -66,8 +67,8 @@ def beside_filterpy() -> tuple[float, float, float]:
     count = len(events.t_s)
     levels, walk = setup.process.arrays()
     gated = np.zeros((count, 3))
-    kept_x, kept_P = np.empty((count, 19)), np.empty((count, 19, 19))
-    nothing = (np.empty((1, 0, TRACE)), np.empty((0, 19)), np.empty((0, 19, 19)))
+    kept_x, kept_P = np.empty((count, SIZE)), np.empty((count, SIZE, SIZE))
+    nothing = (np.empty((1, 0, TRACE)), np.empty((0, SIZE)), np.empty((0, SIZE, SIZE)))
 
     def recursion(*kept: np.ndarray) -> None:
         x, P, w = starting_state(setup, rows)
@@ -94,7 +95,7 @@ def beside_filterpy() -> tuple[float, float, float]:
 def rows() -> list[Row]:
     """One row."""
     mine, theirs, difference = beside_filterpy()
-    note = f"19 states, differ by {difference:.0e} deviations"
+    note = f"{SIZE} states, differ by {difference:.0e} deviations"
     return [Row("estimator, one row of a log", "filterpy EKF", mine, theirs, 200.0, note=note)]
 
 
@@ -102,7 +103,7 @@ def main() -> None:
     """Print the table."""
     mine, theirs, difference = beside_filterpy()
     print(
-        f"one level, 19 states: {1e6 * mine:.2f} us per row, filterpy {1e6 * theirs:.0f} us: "
+        f"one level, {SIZE} states: {1e6 * mine:.2f} us per row, filterpy {1e6 * theirs:.0f} us: "
         f"{theirs / mine:.0f} times as fast"
     )
     print(f"largest difference {difference:.1e} standard deviations")

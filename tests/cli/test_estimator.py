@@ -17,6 +17,7 @@ from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
 from calib.io.logs import Log, write_log
 from calib.io.states import STATES
+from calib.stages.firmware.header import header_of
 from calib.twin.rig import SimulatedRig
 
 from .conftest import Run
@@ -78,6 +79,25 @@ def test_at_rest_the_offset_is_not_observable(
     rest = section.sigma["rest_angle_rad"]
     assert isinstance(rest, float)
     assert rest < np.radians(0.1)
+
+
+def test_signs_that_are_turned_in_the_logs_are_told_to_the_board(
+    calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path
+) -> None:
+    """An IMU upside down: without that the board would take the angle for its negative."""
+    columns = logs["swing"].columns
+    turned = {name: -columns[name] for name in ("ay_mps2", "gz_radps")}
+    path = _put(tmp_path, "swing", logs["swing"], **turned)
+    (tmp_path / "columns.yaml").write_text(
+        "".join(f"{name}: {{column: {name}, factor: -1}}\n" for name in turned)
+    )
+    done = calib("align", path, "--rig", rig)
+    assert (done.code, "gz_radps, ay_mps2: the sign is turned" in done.out) == (1, True)
+    rig.write_text(rig.read_text() + "geometry: {imu_sign: [1, -1, -1]}\n")
+    done = calib("align", path, "--rig", rig)
+    assert "the sign is turned" not in done.out
+    header = header_of(Rig.load(rig), "rig.yaml").values
+    assert [header[f"CALIB_IMU_SIGN_{axis}"] for axis in ("AX", "AY", "GZ")] == [1, -1, -1]
 
 
 def test_a_rig_without_camera_or_plane(calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from outside import outside
 from calib.cli.verbs import verb
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.logs import log_text, read_log
+from calib.io.logs import log_text, read_log, write_log
 from calib.stages import stage
 from calib.stages.imu.tracks import missing
 from calib.twin.rig import SimulatedRig
@@ -284,6 +284,19 @@ def test_figures_are_drawn_in_imu_drift(calib: Run, logs_imu_drift: dict[str, Pa
     assert calib(*words, "--figures", tmp_path / "figures").code == 0
     found = sorted(path.name for path in (tmp_path / "figures").iterdir())
     assert found == ["drift_angles.png", "drift_motion_3.png", "drift_slopes.png"]
+
+
+def test_a_log_that_never_rests_and_has_no_truth_is_drawn(
+    calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path
+) -> None:
+    """It shows no slope, as logs of real rigs in motion do."""
+    log = read_log(logs_imu_drift["moves"])
+    bare = replace(log, columns={n: v for n, v in log.columns.items() if not n.startswith("true_")})
+    write_log(tmp_path / "log.csv", bare)
+    both = logs_imu_drift["a"], tmp_path / "log.csv"
+    words = ("imu", "drift", *both, "--no-peers", "--rig", tmp_path / "rig.yaml")
+    assert calib(*words, "--figures", tmp_path / "figures").code == 0
+    assert (tmp_path / "figures" / "drift_slopes.png").exists()
 
 
 def test_a_gyroscope_that_sticks_is_no_ok(

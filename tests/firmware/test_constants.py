@@ -349,6 +349,13 @@ def _with(section: str, **changes: object) -> Rig:
     return whole.with_sections({section: getattr(whole, section).model_copy(update=changes)})
 
 
+def test_gains_for_an_imu_that_nobody_has_measured_are_poor() -> None:
+    whole = rig("full")
+    assert "neither imu nor align" not in str(header_of(whole, "rig.yaml").verdict.reasons)
+    bare = whole.only([name for name in whole.sections if name not in ("imu", "align", "estimator")])
+    assert "neither imu nor align" in str(header_of(bare, "rig.yaml").verdict.reasons)
+
+
 @pytest.mark.parametrize(("offset_s", "ticks"), [(0.0255, 1.53), (0.0, 0.0), (0.1, 6.0), (-0.008, 0.0)])
 def test_the_delay_of_the_pictures_is_honoured_to_parts_of_a_tick(offset_s: float, ticks: float) -> None:
     made = header_of(_with("align", time_offset_s=offset_s), "rig.yaml")

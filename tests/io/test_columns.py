@@ -112,6 +112,20 @@ def test_marks_of_other_countries(tmp_path: Path, mark: str, comma: str) -> None
     assert all(np.array_equal(log.columns[name], plain.columns[name]) for name in AXES)
 
 
+@pytest.mark.parametrize(
+    "above", ["Initializing...\n\nfound it at 0x68, ready\n", "7,0.1\n", "The time is now, ready\n"]
+)
+def test_what_a_board_says_above_the_header_is_passed_over(tmp_path: Path, above: str) -> None:
+    t, values = _imu()
+    path = _written(tmp_path / "log.csv", ["millis", *AXES], [1e3 * t, *values.T])
+    plain = read_log(path)
+    path.write_text(above + path.read_text(encoding="utf-8-sig"))
+    log = read_log(path)
+    assert all(np.array_equal(log.columns[name], plain.columns[name]) for name in AXES)
+    assert log.lines[0] == plain.lines[0] + above.count("\n")
+    assert log.map is not None and f"the table from line {log.lines[0] - 1} on, below" in log.map.narration
+
+
 def test_a_file_without_a_header(tmp_path: Path) -> None:
     t, values = _imu()
     columns = [1e3 * t, *values[:, [0, 1, 5]].T]

@@ -318,6 +318,8 @@ def test_without_a_plane_logs_cannot_be_flashed_and_pictures_alone_can() -> None
     assert (logged.answer, logged.exit_code) == ("not yet", 1)
     pictures = decide(told | {"logs": []}, camera)
     assert (pictures.answer, pictures.exit_code) == ("yes", 0)
+    both = decide(_whole(control="skipped") | {"logs": []}, camera | {"plane": {"verdict": "ok"}})
+    assert (both.answer, "drives no pumps" in both.headline) == ("yes", True)
 
 
 def test_weak_points_are_grouped_by_reason() -> None:

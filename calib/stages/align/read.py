@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.logs import Log
+from calib.io.logs import Log, unclipped
 from calib.stages.align.solve import AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import QUANTITIES, sensor_values, view_coefficients
@@ -32,6 +32,7 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
 
     Raises `BadInputError` for time that runs backwards, and sensors that are stuck or contradict each other.
     """
+    heard, log = log.passed, unclipped(log)
     camera = log.signals("u_px", "v_px") if len(log.sampled("u_px", "v_px")) else None
     if not len(log.sampled("gz_radps")):
         return None, [f"{log.source}: has no gyroscope (gz_radps), which an alignment needs"]
@@ -45,7 +46,7 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
         if name in imu.names:
             readings[:, k] = imu[name]
     both = np.isfinite(readings[:, :2]).all(axis=1)
-    remarks = []
+    remarks = [f"{log.source}: {one}" for one in log.passed.sentences if one not in heard.sentences]
     if not both.any():
         remarks.append(f"{log.source}: has no accelerometer; the mount angle stays unknown")
     else:

@@ -10,7 +10,7 @@ from calib.core.errors import BadInputError
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Stage, later
 from calib.core.units import parse_length_m
-from calib.core.verdict import Verdict
+from calib.core.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
     from calib.core.rig import Geometry, Rig
@@ -33,23 +33,32 @@ class AlignOptions(LogOptions):
 
 @dataclass(frozen=True)
 class AlignInputs:
-    """Readings, what is known beforehand, and the drawing of the marker; None where it was measured."""
+    """Readings, what is known beforehand, the drawing of the marker, None where it was measured, and columns
+    whose sign was turned where the logs were read, of which nobody has told the board.
+    """
 
     logs: Sequence[AlignLog]
     settings: Settings
     drawn: Geometry | None
+    turned: Sequence[str] = ()
 
 
 def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     from calib.core.rig import Geometry
-    from calib.io.logs import read_log
+    from calib.io.logs import IN_PLANE, read_log
     from calib.stages.align.read import align_log, settings_from_rig
 
     rig.current_plane(files.rig_path)
     files.hashes |= rig.identities("geometry", "camera", "plane")
     logs: list[AlignLog] = []
+    turned: dict[str, None] = {}
+    told = rig.geometry is not None and rig.geometry.imu_sign is not None
     for path in files.paths:
-        log, remarks = align_log(read_log(path, options, files.remarks, rig.picture_px))
+        read = read_log(path, options, files.remarks, rig.picture_px)
+        log, remarks = align_log(read)
+        if read.map is not None and not told:
+            names = (name for name in IN_PLANE if name in read.map.sources)
+            turned |= dict.fromkeys(name for name in names if read.map.sources[name].factor < 0.0)
         files.remarks += remarks
         if log is not None:
             logs.append(replace(log, source=files.taken(path)))
@@ -57,7 +66,7 @@ def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
         raise BadInputError(files.remarks[-1])
     settings = settings_from_rig(rig, files.rig_path, logs, options.marker_offset_m)
     drawn = None if options.marker_offset_m is not None else rig.geometry or Geometry()
-    return AlignInputs(logs, settings, drawn)
+    return AlignInputs(logs, settings, drawn, tuple(turned))
 
 
 def _solve(inputs: AlignInputs) -> Align:
@@ -75,6 +84,13 @@ def _solve(inputs: AlignInputs) -> Align:
     if inputs.drawn is not None:
         found, drawn = with_drawn_marker(found, inputs.drawn)
         verdict = Verdict.of([*verdict.findings, drawn])
+    if inputs.turned:
+        names = ", ".join(inputs.turned)
+        text = f"{names}: the sign is turned where the logs are read, and the board reads the sensor itself"
+        state = (
+            "state in rig.yaml, of ax, ay and gz: geometry: {imu_sign: [1, -1, -1]}, or 1 where it does not"
+        )
+        verdict = Verdict.of([*verdict.findings, Finding("poor", text, state)])
 
     def by_key(values: Mapping[str, Any]) -> dict[str, Any]:
         listed = {key: [values[name] for name in names] for key, names in SENSORS_OF.items()}

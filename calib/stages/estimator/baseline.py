@@ -22,12 +22,10 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.geometry import box_grid, fit_homography
+from calib.io.states import BASELINE
 from calib.stages.actuator.kinematics import inverse_coefficients
 from calib.stages.estimator.kinematic import Rows
 from calib.stages.estimator.sensors import SIZE, marker
-
-BASELINE = ("t_s", "q1_m", "q2_m", "phi_rad", "length_m", "x_m", "y_m")
-"""Columns of the output."""
 
 _SERIES = np.array([float(c) for c in inverse_coefficients()])
 _MEMORY = 12

@@ -16,7 +16,7 @@ from calib.core.files import shown
 from calib.core.options import LogOptions
 from calib.core.result import CovarianceTable
 from calib.core.rig import Rig
-from calib.io.logs import Log, iter_log, refuse_counts
+from calib.io.logs import Log, iter_log, refuse_counts, unclipped
 from calib.solve.clock import time_axis
 from calib.stages.actuator.section import Standing
 from calib.stages.align.section import SENSORS_OF
@@ -137,7 +137,7 @@ def blocks(path: Path, options: LogOptions, picture_px: tuple[int, int] | None) 
         known = True
         if len(block):
             rows += len(block)
-            yield block
+            yield unclipped(block)
     if rows == 0:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
 

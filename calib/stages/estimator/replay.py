@@ -33,8 +33,8 @@ from calib.core.stage import ProgressCall
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.io.columns import Passed
 from calib.io.logs import Log, Watch
-from calib.io.states import STATES, states_writer
-from calib.stages.estimator.baseline import BASELINE, Baseline
+from calib.io.states import BASELINE, STATES, states_writer
+from calib.stages.estimator.baseline import Baseline
 from calib.stages.estimator.consistency import SENSORS, SETTLED_S, Tally
 from calib.stages.estimator.driven import (
     Drive,

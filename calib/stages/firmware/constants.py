@@ -473,6 +473,7 @@ def constants(lookup: Lookup, plane: PlaneConstants | None) -> dict[str, Any]:
         "offset_ticks": ticks,
         "offset_part": max(ticks - delay, 0.0),
         "imu": imu,
+        "imu_sign": lookup.find("geometry.imu_sign") or [1, 1, 1],
         "levelling": _levelling(lookup, rate_hz),
         "mahony": {
             "Kp": lookup.number("orientation_filter.Kp_per_s", 3.0, 0.0, rate_hz),

@@ -252,6 +252,9 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
         findings.append(Finding("remark", text, f"run calib {verb}"))
     elif whole.controller is None:
         findings.append(Finding("remark", _UNTUNED, "run calib identify and calib control tune"))
+    elif whole.imu is None and whole.align is None:
+        text = "neither imu nor align: the board's angle comes from an IMU that nobody has measured"
+        findings.append(Finding("poor", text, "run calib imu static and calib align"))
     if whole.align is not None and whole.align.time_offset_s < 0.0:
         early_ms = -1e3 * whole.align.time_offset_s
         text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"

@@ -343,7 +343,8 @@ def _slopes(logs: Sequence[LogDrift]) -> Figure:
         have = {name: m for name, m in log.section.methods.items() if m.slope_degps is not None}
         at = np.array([names.index(name) for name in have]) + 0.6 * ((j + 0.5) / len(logs) - 0.5)
         value = np.array([m.slope_degps for m in have.values()])
-        ends = np.array([m.interval_degps for m in have.values()], dtype=np.float64)
+        # A log that never rests shows no slope.
+        ends = np.array([m.interval_degps for m in have.values()], dtype=np.float64).reshape(-1, 2)
         half = np.nan_to_num(0.5 * np.ptp(ends, axis=1))
         marks.append(Curve(value, at, kind="points", colour=hue, spread=half, across=True))
     x = "slope (degrees/s)"

@@ -11,8 +11,8 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, runs
 from calib.core.errors import BadInputError
-from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding
+from calib.io.logs import clipped
 from calib.solve.clock import Gap, Part, time_axis
 
 # ----------------------------------------------------------------------
@@ -20,11 +20,6 @@ from calib.solve.clock import Gap, Part, time_axis
 #
 # When the samples were taken says `calib.solve.clock`. Rows that repeat both stamp and readings are one
 # sample written twice, and are dropped before (`calib.io.logs`).
-
-_GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
-_ACCEL_RANGES = tuple(g * GRAVITY_MPS2 for g in (2.0, 4.0, 8.0, 16.0, 32.0))
-_AT_LIMIT_IN_A_ROW = 3
-
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 """Rates of rotation [rad/s] and specific forces [m/s^2] by name."""
@@ -186,18 +181,6 @@ def rounding(variance: float, step: float) -> float:
     return 0.25 * step * math.sqrt(max(1.0 - variance / (_HIDDEN * step**2), 0.0)) if step > 0.0 else 0.0
 
 
-def _at_limit(values: FloatArray, gyro: bool) -> int:
-    """Readings at the end of a usual range, in runs of at least `_AT_LIMIT_IN_A_ROW`."""
-    count = 0
-    for extreme in (float(values.max()), float(values.min())):
-        ends = _GYRO_RANGES if gyro else _ACCEL_RANGES
-        if not any(0.999 * end <= abs(extreme) <= 1.0005 * end for end in ends):
-            continue
-        lengths = [stop - start for start, stop in runs(values == extreme)]
-        count += sum(length for length in lengths if length >= _AT_LIMIT_IN_A_ROW)
-    return count
-
-
 def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
     """Readings at even steps, in parts without long gaps, and how they were sampled.
 
@@ -220,7 +203,8 @@ def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
         gaps=axis.gaps,
         step=np.array([_step(column) for column in values.T]),
         at_limit=np.array(
-            [_at_limit(column, bool(g)) for column, g in zip(values.T, log.gyro, strict=True)], dtype=np.int64
+            [clipped(column, bool(g)).sum() for column, g in zip(values.T, log.gyro, strict=True)],
+            dtype=np.int64,
         ),
     )
     return sampling, parts

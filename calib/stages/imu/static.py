@@ -85,7 +85,7 @@ class StaticLog:
     sampling : rate, jitter, gaps, steps.
     motions : where it moves; `rest_s` is what is left, `moved_share` of the log what is not.
     steps : jumps of a bias.
-    mean : (axes,) of the rest.
+    mean, rounded : (axes,) of the rest, and the deviation of that by the rounding of readings.
     gyro, onchip : drift of the angle by -gz and by the chip, None without that column.
     """
 
@@ -95,6 +95,7 @@ class StaticLog:
     motions: tuple[Motion, ...]
     rest_s: float
     mean: FloatArray
+    rounded: FloatArray
     steps: tuple[BiasStep, ...]
     gyro: Drift | None
     onchip: Drift | None
@@ -166,7 +167,13 @@ def _rest_of(log: Readings) -> StaticLog:
         onchip = _slope(log.onchip_t_s, log.onchip_phi_rad)
     rest_s = samples * sampling.period_s
     steps = bias_steps(still, sampling.period_s, log.gyro)
-    return StaticLog(log.source, sampling, still, motions, rest_s, mean, steps, None, onchip)
+    # By differences, which a slow drift does not enter, of readings as they are.
+    apart = np.concatenate([np.diff(log.values[part.rows], axis=0) for part in still])
+    scatter = 0.5 * (apart**2).mean(axis=0)
+    rounded = np.array(
+        [rounding(v, q) for v, q in zip(scatter.tolist(), sampling.step.tolist(), strict=True)]
+    )
+    return StaticLog(log.source, sampling, still, motions, rest_s, mean, rounded, steps, None, onchip)
 
 
 _BIN_S = 1.0
@@ -246,9 +253,7 @@ def _axis_noise(axis: str, k: int, logs: Sequence[StaticLog], period_s: float) -
     if all(float(np.ptp(column)) == 0.0 for column in columns):
         return AxisNoise(axis, bias, math.nan, None, 0.0)
     allan = analyse(columns, period_s)
-    # By differences, which a slow drift does not enter.
-    variance = 0.5 * float(np.mean(np.concatenate([np.diff(column) for column in columns]) ** 2))
-    rounded = max(rounding(variance, float(log.sampling.step[k])) for log in logs)
+    rounded = max(float(log.rounded[k]) for log in logs)
     if rounded > 0.0:
         known = replace(allan.N, sigma=max(allan.N.sigma, _UNKNOWN_N * allan.N.value))
         allan = replace(allan, N=known)
@@ -300,6 +305,8 @@ _LONG_S = 7200.0
 """A log that shows no random walk within this will hardly do so within the next hours."""
 _MOST_REPEATED = 0.02
 _MOST_SIGMA_OF_N = 0.20
+_MOST_ROUNDED_RADPS, _MOST_ROUNDED_MPS2 = 1e-3, 0.02
+"""What rounding may shift a bias by: three degrees in a minute, a tenth of a degree of tilt."""
 _LEAST_REST_S = 10.0
 _LEAST_CHANCE = 1e-4
 _SHOWN_MOTIONS = 3
@@ -377,11 +384,13 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
         return
     N = allan.N
     if noise.rounded > 0.0:
+        most, unit = (_MOST_ROUNDED_RADPS, "rad/s") if axis[0] == "g" else (_MOST_ROUNDED_MPS2, "m/s^2")
+        poor = noise.rounded > most
         yield Finding(
-            "poor",
+            "poor" if poor else "remark",
             f"{axis}: its noise is less than half its step, so that bias and noise depend on where between "
-            "two steps it lies",
-            "set the sensor to a finer range or a wider filter",
+            f"two steps it lies; the bias by {noise.rounded:.2g} {unit}",
+            "set the sensor to a finer range or a wider filter" if poor else "",
         )
     elif not N.sigma <= _MOST_SIGMA_OF_N * N.value:
         share = N.sigma / N.value if N.value > 0.0 else math.inf

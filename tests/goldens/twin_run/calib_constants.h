@@ -169,11 +169,11 @@
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
- * dphi/dt = -gz. rig.yaml has no key for the signs of the axes, they are 1.
+ * dphi/dt = -gz. The signs of the axes are geometry.imu_sign of rig.yaml.
  */
-#define CALIB_IMU_SIGN_AX 1 /* 1 or -1, by hand for an IMU that is not right-handed as mounted */
-#define CALIB_IMU_SIGN_AY 1 /* 1 or -1 */
-#define CALIB_IMU_SIGN_GZ 1 /* 1 or -1 */
+#define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
+#define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
+#define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
 #define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0619768463f /* subtracted from ax, m/s^2 */
 #define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.034240175f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.00329101f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
