@@ -794,12 +794,10 @@ def _mend(
             continue
         flags |= 1
         for i in range(SIZE if bad else 6):
-            if i < 6 and (bad or i >= 2):
+            if bad or i >= 2:
                 x[i] = head[i]
-            elif not abs(x[i]) < 1e6:
-                x[i] = 0.0
             # A level that has left the model starts again from the prior, all of it.
-            _clear(P, i, head_sigma[i] ** 2 if i < 6 else 1e-2)
+            _clear(P, i, head_sigma[i] ** 2)
     return flags
 
 
@@ -889,7 +887,9 @@ class _Memory(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """What does not change, as in `bank_event` and `Start`; radius of a bellows, delay of pictures [s]."""
+    """What does not change, as in `bank_event`; prior (20,) of head and sensors and its deviations, radius
+    of a bellows, delay of pictures [s].
+    """
 
     switch_hz: float
     levels: FloatArray
@@ -1077,7 +1077,8 @@ class Filter:
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         levels, walk = setup.process.arrays()
-        start, size = setup.start, setup.ring
+        size = setup.ring
+        prior, covariance, _ = starting_state(setup)
         # One slot more than the ring has, for what is only looked ahead.
         self._bank = Bank(*banked(*starting_state(setup), size + 1))
         self._events = no_events(size, np.empty(0))
@@ -1086,8 +1087,8 @@ class Filter:
             new_clock(setup.imu_period_s),
         )  # fmt: skip
         self._model = _Model(
-            setup.process.switch_hz, levels, walk, setup.view, setup.noise, start.head, start.head_sigma,
-            setup.bellows_radius_m, setup.delay_s,
+            setup.process.switch_hz, levels, walk, setup.view, setup.noise, prior[0],
+            np.sqrt(np.diag(covariance[0])), setup.bellows_radius_m, setup.delay_s,
         )  # fmt: skip
         self._room = _Room(
             np.empty((len(levels), *WORK)), np.zeros((len(levels), 7)), np.empty(len(REPORT)),
