@@ -53,7 +53,7 @@ def convert(
     if read_as is not None and read_as.narration:
         narrate(read_as.narration)
     names = tuple(first.columns)
-    rows, passed, beyond, before, back = 0, Passed(), Passed(), -np.inf, list[str]()
+    rows, passed, beyond, before, back, first_back = 0, Passed(), Passed(), -np.inf, 0, ""
     with (
         states_writer(output, ("t_s", *names), LOG) as add,
         progress_bar(f"converting {log.name}") as progress,
@@ -61,9 +61,11 @@ def convert(
         for block in chain([first], stream):
             add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
             rows, passed, beyond = rows + len(block), passed + block.passed, beyond + within(block).passed
-            for k in np.flatnonzero(np.diff(block.t_s, prepend=before) < 0.0).tolist():
-                back.append(f"line {block.lines[k]}: the time goes back to {block.t_s[k]:g} s")
-            before = block.t_s[-1]
+            again = np.flatnonzero(np.diff(block.t_s, prepend=before) < 0.0)
+            if len(again) and not back:
+                k = again[0]
+                first_back = f"line {block.lines[k]}: the time goes back to {block.t_s[k]:g} s"
+            back, before = back + len(again), block.t_s[-1]
             progress(rows, 0)
     if save_columns is not None and read_as is not None:
         write_atomically(save_columns, read_as.text(), COLUMNS_FILE)
@@ -85,6 +87,4 @@ def convert(
         many = f"{beyond.beyond} cells hold more than any sensor gives ({beyond.first})"
         narrate(f"{many}; they are written, and other verbs pass them over")
     if back:
-        narrate(
-            f"{back[0]}{f', as in {len(back) - 1} more lines' * (len(back) > 1)}; other verbs refuse that"
-        )
+        narrate(f"{first_back}{f', as in {back - 1} more lines' * (back > 1)}; other verbs refuse that")

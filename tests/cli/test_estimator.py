@@ -92,8 +92,12 @@ def test_signs_that_are_turned_in_the_logs_are_told_to_the_board(
         "".join(f"{name}: {{column: {name}, factor: -1}}\n" for name in turned)
     )
     done = calib("align", path, "--rig", rig)
-    assert (done.code, "gz_radps, ay_mps2: the sign is turned" in done.out) == (1, True)
-    rig.write_text(rig.read_text() + "geometry: {imu_sign: [1, -1, -1]}\n")
+    assert (done.code, "ay_mps2, gz_radps: the sign is turned" in done.out) == (1, True)
+    assert "state -1 for ay_mps2, -1 for gz_radps in geometry.imu_sign" in done.out
+    before = rig.read_text()
+    rig.write_text(before + "geometry: {imu_sign: [1, 1, -1]}\n")
+    assert "ay_mps2: the sign is turned" in calib("align", path, "--rig", rig).out
+    rig.write_text(before + "geometry: {imu_sign: [1, -1, -1]}\n")
     done = calib("align", path, "--rig", rig)
     assert "the sign is turned" not in done.out
     header = header_of(Rig.load(rig), "rig.yaml").values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
@@ -31,34 +31,39 @@ class AlignOptions(LogOptions):
     )
 
 
+_SIGNED = ("ax_mps2", "ay_mps2", "gz_radps")
+"""Columns of `geometry.imu_sign`."""
+
+
 @dataclass(frozen=True)
 class AlignInputs:
-    """Readings, what is known beforehand, the drawing of the marker, None where it was measured, and columns
-    whose sign was turned where the logs were read, of which nobody has told the board.
+    """Readings, what is known beforehand, the drawing of the marker, None where it was measured, and by
+    column the sign with which the logs were read, where the board has another one.
     """
 
     logs: Sequence[AlignLog]
     settings: Settings
     drawn: Geometry | None
-    turned: Sequence[str] = ()
+    signs: Mapping[str, int] = field(default_factory=dict)
 
 
 def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
     from calib.core.rig import Geometry
-    from calib.io.logs import IN_PLANE, read_log
+    from calib.io.logs import read_log
     from calib.stages.align.read import align_log, settings_from_rig
 
     rig.current_plane(files.rig_path)
     files.hashes |= rig.identities("geometry", "camera", "plane")
     logs: list[AlignLog] = []
-    turned: dict[str, None] = {}
-    told = rig.geometry is not None and rig.geometry.imu_sign is not None
+    signs: dict[str, int] = {}
+    board = dict(zip(_SIGNED, (rig.geometry and rig.geometry.imu_sign) or (1, 1, 1), strict=True))
     for path in files.paths:
         read = read_log(path, options, files.remarks, rig.picture_px)
         log, remarks = align_log(read)
-        if read.map is not None and not told:
-            names = (name for name in IN_PLANE if name in read.map.sources)
-            turned |= dict.fromkeys(name for name in names if read.map.sources[name].factor < 0.0)
+        if read.map is not None:
+            sources = read.map.sources
+            own = {name: -1 if sources[name].factor < 0.0 else 1 for name in _SIGNED if name in sources}
+            signs |= {name: sign for name, sign in own.items() if sign != board[name]}
         files.remarks += remarks
         if log is not None:
             logs.append(replace(log, source=files.taken(path)))
@@ -66,7 +71,7 @@ def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
         raise BadInputError(files.remarks[-1])
     settings = settings_from_rig(rig, files.rig_path, logs, options.marker_offset_m)
     drawn = None if options.marker_offset_m is not None else rig.geometry or Geometry()
-    return AlignInputs(logs, settings, drawn, tuple(turned))
+    return AlignInputs(logs, settings, drawn, signs)
 
 
 def _solve(inputs: AlignInputs) -> Align:
@@ -84,12 +89,11 @@ def _solve(inputs: AlignInputs) -> Align:
     if inputs.drawn is not None:
         found, drawn = with_drawn_marker(found, inputs.drawn)
         verdict = Verdict.of([*verdict.findings, drawn])
-    if inputs.turned:
-        names = ", ".join(inputs.turned)
-        text = f"{names}: the sign is turned where the logs are read, and the board reads the sensor itself"
-        state = (
-            "state in rig.yaml, of ax, ay and gz: geometry: {imu_sign: [1, -1, -1]}, or 1 where it does not"
-        )
+    if inputs.signs:
+        names = ", ".join(inputs.signs)
+        text = f"{names}: the sign is turned where the logs are read, or on the board, alone"
+        wanted = ", ".join(f"{sign:d} for {name}" for name, sign in inputs.signs.items())
+        state = f"the board reads the sensor itself: state {wanted} in geometry.imu_sign, of ax, ay and gz"
         verdict = Verdict.of([*verdict.findings, Finding("poor", text, state)])
 
     def by_key(values: Mapping[str, Any]) -> dict[str, Any]:
