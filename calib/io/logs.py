@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -170,15 +170,23 @@ def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
 
 def within(log: Log) -> Log:
     """The log with blanks for cells that no sensor can have given."""
-    columns, passed = dict(log.columns), log.passed
-    for name, values in log.columns.items():
-        far = np.flatnonzero(np.abs(values) > _MOST.get(kind_of(name), math.inf))
-        if len(far) and log.unit(name) != "counts":
-            first = f"{name} is {values[far[0]]:.6g} in line {log.lines[far[0]]}"
-            passed += Passed(beyond=len(far), first=first)
-            columns[name] = values.copy()
-            columns[name][far] = np.nan
-    return log if passed == log.passed else replace(log, columns=columns, passed=passed)
+    far = {
+        name: np.flatnonzero(np.abs(values) > _MOST.get(kind_of(name), math.inf))
+        for name, values in log.columns.items()
+        if log.unit(name) != "counts"
+    }
+    return _blanked(log, far, lambda count, first: Passed(beyond=count, first=first))
+
+
+def _blanked(log: Log, cells: Mapping[str, IntArray], passed: Callable[[int, str], Passed]) -> Log:
+    """The log with blanks for these cells, rows by column; `passed` gets their number and the first one."""
+    columns, told = dict(log.columns), log.passed
+    for name, rows in cells.items():
+        if len(rows):
+            told += passed(len(rows), f"{name} is {columns[name][rows[0]]:.6g} in line {log.lines[rows[0]]}")
+            columns[name] = columns[name].copy()
+            columns[name][rows] = np.nan
+    return log if told == log.passed else replace(log, columns=columns, passed=told)
 
 
 _GYRO_RANGES = tuple(math.radians(r) for r in (125.0, 245.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0))
@@ -200,15 +208,9 @@ def clipped(values: FloatArray, gyro: bool) -> BoolArray:
 
 def unclipped(log: Log) -> Log:
     """The log with blanks for readings of the IMU at the end of their range: the truth is beyond."""
-    columns, passed = dict(log.columns), log.passed
-    for name in (name for name in IMU if name in columns and log.unit(name) != "counts"):
-        rows = np.flatnonzero(clipped(columns[name], kind_of(name) == "gyro"))
-        if len(rows):
-            end = f"{name} is {columns[name][rows[0]]:.6g} in line {log.lines[rows[0]]}"
-            passed += Passed(clipped=len(rows), end=end)
-            columns[name] = columns[name].copy()
-            columns[name][rows] = np.nan
-    return log if passed == log.passed else replace(log, columns=columns, passed=passed)
+    names = (name for name in IMU if name in log.columns and log.unit(name) != "counts")
+    end = {name: np.flatnonzero(clipped(log.columns[name], kind_of(name) == "gyro")) for name in names}
+    return _blanked(log, end, lambda count, first: Passed(clipped=count, end=first))
 
 
 def _counted_on(blocks: Iterator[Block]) -> Iterator[Block]:

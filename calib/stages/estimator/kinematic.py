@@ -896,8 +896,8 @@ class _Model(NamedTuple):
     walk: FloatArray
     camera: FloatArray
     noise: FloatArray
-    head: FloatArray
-    head_sigma: FloatArray
+    prior: FloatArray
+    prior_sigma: FloatArray
     radius: float
     delay: float
 
@@ -915,7 +915,7 @@ class _Room(NamedTuple):
 @kernel(arrays=False)
 def _begin_at(u: float, v: float, bank: Bank, slot: int, memory: _Memory, model: _Model) -> int:
     """Begin at a picture where it shows a head that a rig can have; flags."""
-    x, rest, flags = bank.x[slot, 0], model.head[1], 0
+    x, rest, flags = bank.x[slot, 0], model.prior[1], 0
     phi, length, found = 0.0, 0.0, False
     for attempt in range(2):
         if not found:
@@ -924,7 +924,7 @@ def _begin_at(u: float, v: float, bank: Bank, slot: int, memory: _Memory, model:
     if found and 0.2 * rest < length < 3.0 * rest:
         if memory.whole[_CAMERA_STARTED] == 1:
             flags = 1
-        _reset_head(bank, slot, model.head, model.head_sigma)
+        _reset_head(bank, slot, model.prior, model.prior_sigma)
         _place_head(bank, slot, phi, length)
         memory.whole[_CAMERA_STARTED], memory.whole[_PENDING] = 1, 0
     return flags
@@ -948,7 +948,7 @@ def _after_rejections(
             return 0
         here = memory.whole[NEWEST]
         phi, length = bank.x[here, 0, 0], bank.x[here, 0, 1]
-        _reset_head(bank, here, model.head, model.head_sigma)
+        _reset_head(bank, here, model.prior, model.prior_sigma)
         _place_head(bank, here, phi, length)
         return 1
     return 0
@@ -969,7 +969,7 @@ def _write_ahead(
         x, P = bank.x[slot, m], bank.P[slot, m]
         copy_state(x, P, bank.x[here, m], bank.P[here, m])
         predict(x, P, levels[m], model.walk, ahead)
-    flags = _mend(bank, slot, model.head, model.head_sigma, model.radius, room.work[0, 5])
+    flags = _mend(bank, slot, model.prior, model.prior_sigma, model.radius, room.work[0, 5])
     write_bank(bank, slot, 0.0, levels, model.radius, out, row)
     return int(flags)
 
@@ -981,7 +981,7 @@ def run_filter(
 ) -> None:  # fmt: skip
     """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT))."""
     whole, real, size, count = memory.whole, memory.real, events.t.shape[0], model.levels.shape[0]
-    head, head_sigma, report = model.head, model.head_sigma, room.report
+    head, head_sigma, report = model.prior, model.prior_sigma, room.report
     z0 = z1 = z2 = late2 = 0.0
     for row in range(len(t)):
         stamp, flags = t[row], 0

@@ -168,8 +168,10 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
         name: max(one, 1e-9) if isinstance(one := deviations.get(name), float) else values[name][1]
         for name in SENSOR
     }
-    usual = {name: values[name][0] for name in SENSOR}
-    values = {name: (usual[name] if found[name] is None else found[name], sigmas[name]) for name in SENSOR}
+    values = {
+        name: (usual if found[name] is None else found[name], sigmas[name])
+        for name, (usual, _) in values.items()
+    }
     covariance = (
         None if align.covariance is None else _covariance(align.covariance, sigmas, _between_logs(rig))
     )

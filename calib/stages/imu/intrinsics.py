@@ -877,7 +877,6 @@ def _turns(
     scatter = np.stack([0.5 * (np.diff(one, axis=0) ** 2).mean(axis=0) for one in held])
     steps = np.zeros(3)
     steps[3 - len(names) :] = step[log.places(*names)]
-    typical = np.median(scatter, axis=0)
     turns = Turns(
         gyro=gyro,
         accel=values[:, columns],
@@ -887,7 +886,7 @@ def _turns(
         rests=rests,
         gyro_mean=np.stack([one.mean(axis=0) for one in held]),
         gyro_scatter=scatter,
-        rounded=np.array([rounding(v, q) for v, q in zip(typical.tolist(), steps.tolist(), strict=True)]),
+        rounded=rounding(np.median(scatter, axis=0), steps),
         initial=0 if quiet.initial_s > 0.0 else int(np.argmax([rest.duration_s for rest in rests])),
         period_s=period_s,
     )

@@ -167,8 +167,8 @@ def _step(values: FloatArray) -> float:
 _HIDDEN = 0.3
 
 
-def rounding(variance: float, step: float) -> float:
-    """Standard deviation of a mean by the rounding of its readings, zero where their noise hides that.
+def rounding(variance: FloatArray, step: FloatArray) -> FloatArray:
+    """Standard deviations (n,) of means by the rounding of readings, zero where their noise hides that.
 
     Readings with less noise than half a step have a mean that depends on where between two steps the signal
     lies. With v = variance / step^2 it is off, RMS over these places, by 0.25 steps where v is next to
@@ -176,9 +176,9 @@ def rounding(variance: float, step: float) -> float:
 
     Parameters
     ----------
-    variance : of single readings at rest. step : their quantisation step, NaN for none.
+    variance : (n,) of single readings at rest. step : (n,) their quantisation step, NaN for none.
     """
-    return 0.25 * step * math.sqrt(max(1.0 - variance / (_HIDDEN * step**2), 0.0)) if step > 0.0 else 0.0
+    return np.asarray(0.25 * np.sqrt(np.maximum(np.nan_to_num(step) ** 2 - variance / _HIDDEN, 0.0)))
 
 
 def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:

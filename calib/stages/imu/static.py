@@ -169,10 +169,7 @@ def _rest_of(log: Readings) -> StaticLog:
     steps = bias_steps(still, sampling.period_s, log.gyro)
     # By differences, which a slow drift does not enter, of readings as they are.
     apart = np.concatenate([np.diff(log.values[part.rows], axis=0) for part in still])
-    scatter = 0.5 * (apart**2).mean(axis=0)
-    rounded = np.array(
-        [rounding(v, q) for v, q in zip(scatter.tolist(), sampling.step.tolist(), strict=True)]
-    )
+    rounded = rounding(0.5 * (apart**2).mean(axis=0), sampling.step)
     return StaticLog(log.source, sampling, still, motions, rest_s, mean, rounded, steps, None, onchip)
 
 
