@@ -14,8 +14,8 @@ from calib.io.logs import write_log
 from calib.stages.actuator.identify import Track, made, values_of
 from calib.stages.actuator.identify_pump import PumpRecord, simulate_pump
 from calib.stages.actuator.machine import Machine
-from calib.stages.actuator.parameters import Creep
-from calib.stages.actuator.pump import TICK_S, RateLimit
+from calib.stages.actuator.parameters import TICK_S, Creep
+from calib.stages.actuator.pump import RateLimit
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.camera.section import Camera, Distortion, Plane
 from calib.twin.rig import SimulatedRig

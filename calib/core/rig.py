@@ -361,6 +361,16 @@ class Rig:
         return {"actuator": in_force(self.actuator, known.actuator), "pump": in_force(self.pump, known.pump)}
 
     @property
+    def tick_hz(self) -> float:
+        """Rate of the board's loop: that of the low-pass, else of the pumps' commands, else 60 Hz."""
+        from calib.stages.actuator.parameters import TICK_S
+
+        if self.lowpass is not None:
+            return self.lowpass.rate_hz
+        tick_s, _ = self.standing["pump"].get("tick_s", (TICK_S, ""))
+        return 1.0 / float(tick_s)
+
+    @property
     def plant(self) -> Plant:
         """The plant: nominal values, over them what was estimated, over it what is known.
 

@@ -43,6 +43,7 @@ _FIRST, _CHUNK, _RECENT = 32, 256, 512
 _FAR = 5.0
 _BLOCKS = (1, 2, 5, 10, 20, 50, 100, 300)
 """Lengths of blocks that the wander may be averaged over."""
+_NOMINAL = 0.01
 _SURE = 8.0
 """Standard deviations, about, by which blocks' means must be further apart than jitter makes them."""
 _NEGLIGIBLE_S = 2e-6
@@ -117,6 +118,16 @@ class TimeAxis:
     def rate_hz(self) -> float:
         """Samples per second."""
         return 1.0 / self.period_s
+
+    @property
+    def nominal_hz(self) -> float:
+        """The rate that a sensor of this one was set to, to 1 %: of whole Hz or whole ms the nearer one."""
+        rate = self.rate_hz
+        if not 0.0 < rate < math.inf:
+            return rate
+        whole = [one for one in (round(rate), 1e3 / max(round(1e3 / rate), 1)) if one > 0]
+        best = min(whole, key=lambda one: abs(one - rate))
+        return float(best) if abs(best / rate - 1.0) < _NOMINAL else rate
 
     @property
     def gaps(self) -> tuple[Gap, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from identifytrials import SIGMA, log_file, rig_file, track, varied
 
+import calib
 from calib.core.errors import BadInputError
 from calib.core.options import PoseOptions
 from calib.core.stage import Files
@@ -473,6 +474,21 @@ def test_a_play_is_found_where_there_is_one(play: dict[str, float], tmp_path: Pa
         assert abs(found.values[name] - width) < 3.5 * sigma[name] < 0.2 * width
     for name in {*truth} & {*found.values}:
         assert abs(found.values[name] - truth[name]) < 3.5 * sigma[name], name
+
+
+@pytest.mark.parametrize("tick_s", [0.01, 1.0 / 30.0])
+def test_the_boards_tick_is_that_of_the_commands(tick_s: float, tmp_path: Path) -> None:
+    known = rig_file(tmp_path / "rig.yaml")
+    rig, truth = varied(7)
+    rig = replace(rig, pump=rig.pump.at(tick_s))
+    paths = [log_file(tmp_path / f"{kind}.csv", rig, kind, 1, 12.0) for kind in ("prbs", "ellipse")]
+    known.actuator, known.pump = calib.identify(paths, known)
+    assert known.pump.tick_s == known.machine.pump.tick_s == pytest.approx(tick_s, rel=1e-12)
+    # Pictures are 25 ms late for whoever has no alignment; the commands' delay and that are one number.
+    late_s = rig.pump.delay_ticks * tick_s + rig.tracker.latency_s - 0.025
+    assert abs(known.pump.delay_ticks * tick_s - late_s) < 0.5 * tick_s + 2e-3
+    assert abs(known.pump.lag_s - truth["lag_s"]) < 4.0 * known.pump.sigma["lag_s"]
+    assert known.tick_hz == pytest.approx(1.0 / tick_s)
 
 
 @pytest.mark.parametrize("kind", ["free", "prbs"])

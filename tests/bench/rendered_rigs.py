@@ -9,9 +9,10 @@ off) and the asymmetry of the pumps are drawn by its seed. Its folder is made as
 then once more after `calib identify` on the logs that were aligned. Nothing is taken from the truth but the
 errors. `--keep` leaves the calibrated folders for another run, which replays only.
 
-The marker sits where its drawing says, or off from there with the deviation `--off`. `--undrawn` says in
-rig.yaml that the drawing is good to 3 mm only, so that the logs have to find the marker. `--wrong` makes the
-rigs in a way that the model does not know (`WRONG`); with `--keep` they take the pictures of the right rig.
+The marker sits where its drawing says, or off from there with the deviation `--off`, which rig.yaml then
+states, as one states what a caliper tells. `--undrawn` says in rig.yaml that the drawing is good to 3 mm,
+so that the logs have to find the marker. `--wrong` makes the rigs in a way that the model does not know
+(`WRONG`); with `--keep` they take the pictures of the right rig.
 
 Errors are the mean over q1 and q2 in millimetres after two seconds: their mean over rigs and their 95th
 percentile, of phi in degrees that percentile, and NEES per degree of freedom, mean and largest. NIS is a mean
@@ -161,12 +162,14 @@ def make(folder: Path, seed: int, off_mm: float, wrong: str | None, pictures: Pa
         (folder / "replayed" / f"{name}.csv").write_text(text)
 
 
-def calibrate(folder: Path, undrawn: bool) -> str:
+def calibrate(folder: Path, undrawn: bool, off_mm: float) -> str:
     """The commands, and the exit codes of those that were not content."""
     rig, said = folder / "rig.yaml", []
     rests, motions = ([str(folder / "logs" / f"{name}.csv") for name in names] for names in (RESTS, ALIGNED))
     if undrawn:
         rig.write_text("geometry: {marker_offset_sigma_m: 0.003}\n")
+    elif off_mm:
+        rig.write_text(f"geometry: {{marker_offset_m: 0.015, marker_offset_sigma_m: {1e-3 * off_mm:f}}}\n")
     for words in (
         ["intrinsics", str(folder / "images")],
         ["extrinsics", str(folder / "images" / "plane")],
@@ -305,7 +308,7 @@ def main() -> None:
             if not (folder / "replayed").exists():
                 make(folder, seed, given.off, given.wrong, right / "images")
             if not (folder / "identified.yaml").exists():
-                said = calibrate(folder, given.undrawn)
+                said = calibrate(folder, given.undrawn, given.off)
             true = drawn(seed, given.off, given.wrong)
             off.append(misaligned(folder, true))
             rigs.append(_off(Rig.load(folder / "identified.yaml"), true, given.wrong))

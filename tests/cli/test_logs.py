@@ -184,7 +184,8 @@ def test_words_that_do_not_fit(
 )
 def test_logs_that_cannot_be_used(calib: Run, tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "log.csv").write_text(text)
-    ended = calib("lowpass", "--suggest", "log.csv", "--jitter", "0.1px", cwd=tmp_path)
+    asked = ("--jitter", "0.1px", "--rate", "60Hz")
+    ended = calib("lowpass", "--suggest", "log.csv", *asked, cwd=tmp_path)
     assert ended.code == 3
     assert sentence in ended.sentence
     assert not (tmp_path / "rig.yaml").exists()

@@ -23,6 +23,7 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.actuator.parameters import Stiffness
 from calib.stages.actuator.pump import ElongationForce
+from calib.stages.align.section import LogCheck
 from calib.stages.camera.model import project, undistort
 from calib.stages.control.laws import Channel, Pid
 from calib.stages.estimator.constant_gain import design, tick_noise
@@ -354,6 +355,15 @@ def test_gains_for_an_imu_that_nobody_has_measured_are_poor() -> None:
     assert "neither imu nor align" not in str(header_of(whole, "rig.yaml").verdict.reasons)
     bare = whole.only([name for name in whole.sections if name not in ("imu", "align", "estimator")])
     assert "neither imu nor align" in str(header_of(bare, "rig.yaml").verdict.reasons)
+
+
+def test_a_camera_slower_than_the_tick_is_poor() -> None:
+    """The guard counts each tick without a picture."""
+    one = LogCheck(name="a.csv", duration_s=9.0, stretches=1, pictures=500, outliers=0, samples=900)
+    for rate_hz, told in ((60.1, False), (50.0, False), (30.0, True)):
+        seen = [one.model_copy(update={"camera_rate_hz": rate_hz})]
+        reasons = str(header_of(_with("align", logs=seen), "rig.yaml").verdict.reasons)
+        assert ("takes a tick without a picture for a lost marker" in reasons) is told
 
 
 @pytest.mark.parametrize(("offset_s", "ticks"), [(0.0255, 1.53), (0.0, 0.0), (0.1, 6.0), (-0.008, 0.0)])

@@ -28,6 +28,7 @@ from scipy.signal import (
     sosfreqz,
 )
 
+import calib
 from calib.core.errors import BadInputError
 from calib.io.logs import read_log, write_log
 from calib.stages.actuator.kinematics import marker_from_head
@@ -340,6 +341,23 @@ def test_positions_are_the_markers_on_the_plane(tmp_path: Path) -> None:
     # A pixel is about 1 mm there; medians pass over the outliers.
     assert np.all(np.median(np.abs(piece.values - at), axis=0) < 0.7e-3)
     assert np.all(np.ptp(at, axis=0) > 0.01)
+
+
+def test_without_a_rate_the_filter_has_that_of_the_logs_camera(tmp_path: Path) -> None:
+    run = run_scenario(make_scenario("ellipse"), SimulatedRig(), 2, "sensors", 8.0)
+    for every, rate_hz in ((1, 60.0), (2, 30.0)):
+        log = log_of(run)
+        dropped = np.rint(60.0 * log.t_s).astype(int) % every > 0
+        for name in ("u_px", "v_px"):
+            log.columns[name][dropped] = np.nan
+        write_log(tmp_path / "log.csv", log)
+        made = calib.lowpass(calib.Rig(), log=tmp_path / "log.csv")
+        assert made.rate_hz == rate_hz
+        assert made.log.held <= 0.02 * made.log.ticks
+        # The filter was not chosen by this log, so that its jitter decides nothing.
+        assert made.verdict.ok
+    with pytest.raises(BadInputError, match="30 camera samples/s, expected the 60 Hz"):
+        calib.lowpass(calib.Rig(), log=tmp_path / "log.csv", rate_hz=60.0)
 
 
 def test_a_filter_that_single_precision_spoils_is_poor() -> None:

@@ -249,3 +249,18 @@ def test_a_log_of_late_steps_is_not_stretched() -> None:
 def test_hardly_any_samples(n: int) -> None:
     assert len(time_axis(np.zeros(n)).t_s) == n
     assert np.isnan(time_axis(np.zeros(n)).period_s)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "nominal_hz"),
+    [
+        (59.94, 60.0),
+        (30.08, 30.0),
+        (62.4, 62.5),
+        (33.3, 1e3 / 30.0),
+        (99.6, 100.0),
+        (40.45, 40.45),
+    ],
+)
+def test_a_measured_rate_is_near_one_that_somebody_set(rate_hz: float, nominal_hz: float) -> None:
+    assert time_axis(np.arange(400) / rate_hz).nominal_hz == pytest.approx(nominal_hz)

@@ -174,13 +174,12 @@ def made(nominal: Machine, values: Mapping[str, float], hoses: bool, tick_s: flo
         creep=Creep(*(v[name] for name in CREEP)),
     )
     pump = replace(
-        nominal.pump,
+        nominal.pump.at(tick_s),
         **of_pump,
         static=StrengthForce(
             curve, static.stiffness, static.supply_V, static.dead_zone_V, (v["strength1"], v["strength2"])
         ),
         deflation=type(law)(**{name: v[name] for name in vars(law)}),
-        tick_s=tick_s,
     )
     return plant, pump
 

@@ -35,6 +35,9 @@ DAMPING_SCALE_PUMPS = 16.0
 SUPPLY_V = 12.0
 """Of the pumps at PWM 255."""
 
+TICK_S = 1.0 / 60.0
+"""Of the commands, and so of the board's loop."""
+
 LONGEST_ELONGATION_M = 0.04
 """Up to here a stiffness law has to stay positive; 12 V reach 0.0266 m."""
 

@@ -42,7 +42,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,10 +51,9 @@ from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import inlined
-from calib.stages.actuator.parameters import SUPPLY_V, Stiffness
+from calib.stages.actuator.parameters import SUPPLY_V, TICK_S, Stiffness
 
 PWM_MAX = 255.0
-TICK_S = 1.0 / 60.0
 
 RATE_LIMIT, ORIFICE = 0, 1
 
@@ -134,6 +133,12 @@ class Pump:
     tick_s: float = TICK_S
     play_pwm: float = 0.0
     play_N: float = 0.0
+
+    def at(self, tick_s: float) -> Pump:
+        """The same pump with commands of another period; its delay in whole ticks of that."""
+        if tick_s == self.tick_s:
+            return self
+        return replace(self, tick_s=tick_s, delay_ticks=round(self.delay_ticks * self.tick_s / tick_s))
 
 
 class PumpCoefficients(NamedTuple):

@@ -19,8 +19,7 @@ from calib.io.tables import read_cells
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord, PumpTable, Settled
 from calib.stages.actuator.machine import Machine
-from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.pump import TICK_S
+from calib.stages.actuator.parameters import TICK_S, Plant
 from calib.stages.control.laws import holding_force
 from calib.stages.estimator.read import periods, setup_from_rig
 from calib.stages.estimator.sensors import GRAVITY_MPS2, SIZE, heads_seen, marker
@@ -359,9 +358,8 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
             f"{log.source}: pwm1 and pwm2 are {float(pwm.max()):.3g} at most, expected 0 to 255; where they "
             "are shares of the full duty, columns.yaml takes them: `pwm1: {column: pwm1, factor: 255}`"
         )
-    tick_s = commands.axis.period_s if len(t) > 2 else TICK_S
     # A nominal rate that the stamps only scatter about is exact.
-    tick_s = TICK_S if abs(tick_s / TICK_S - 1.0) < 0.01 else tick_s
+    tick_s = 1.0 / commands.axis.nominal_hz if len(t) > 2 else TICK_S
     if not tick_s * _MOST_TICKS > end - float(t[0]):
         raise BadInputError(
             f"{log.source}: its commands are {tick_s:g} s apart, over {end - float(t[0]):g} s; "

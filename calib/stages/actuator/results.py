@@ -234,14 +234,19 @@ def _pump(found: Identified, rig: Rig, judgement: dict[str, Any]) -> PumpSection
     delay = _delay(found)
     remarks = []
     if delay is not None:
-        tick_s = nominal.pump.tick_s
-        ticks = nominal.pump.delay_ticks + round(delay[0] / tick_s)
+        stated = None if rig.known is None or rig.known.pump is None else rig.known.pump.tick_s
+        logged_s = next(track.tick_s for track in problem.tracks if track.hoses)
+        dead_s = nominal.pump.at(logged_s).delay_ticks * logged_s + delay[0]
+        tick_s = stated or logged_s
+        if tick_s != nominal.pump.tick_s:
+            section["tick_s"] = tick_s
+        ticks = round(dead_s / tick_s)
         if ticks >= 0:
             section["delay_ticks"] = ticks
             sigma["delay_ticks"] = delay[1] / tick_s
             late = problem.delay_s
             remarks.append(
-                f"dead time {1e3 * (nominal.pump.delay_ticks * tick_s + delay[0]):.3g} +- "
+                f"dead time {1e3 * dead_s:.3g} +- "
                 f"{1e3 * delay[1]:.2g} ms if pictures are {1e3 * late:.3g} ms late: "
                 "logs of the camera tell their sum alone"
             )

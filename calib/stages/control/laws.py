@@ -25,10 +25,9 @@ from calib.stages.actuator.kinematics import (
     forward_jacobian,
     marker_from_head,
 )
-from calib.stages.actuator.parameters import Plant
+from calib.stages.actuator.parameters import TICK_S, Plant
 from calib.stages.actuator.pump import (
     PWM_MAX,
-    TICK_S,
     Orifice,
     Pump,
     advance_pump,

@@ -236,7 +236,7 @@ run = Stage(
     sources=_REFERENCE,
     metavar="REFERENCE",
     several=False,
-    uses=("camera", "plane", "actuator", "pump", "controller", "twin"),
+    uses=("camera", "plane", "lowpass", "actuator", "pump", "controller", "twin"),
     document=_run_document,
     words=_run_words,
     plots=later("calib.stages.control.plots", "run_plots"),
@@ -381,7 +381,7 @@ check = Stage(
     sources=_REFERENCE,
     metavar="REFERENCE",
     several=False,
-    uses=("camera", "plane", "actuator", "pump", "controller", "twin"),
+    uses=("camera", "plane", "lowpass", "actuator", "pump", "controller", "twin"),
     output=Output(
         "Write the reference slowed down so far that the pumps follow it.",
         _write_slower,
@@ -580,6 +580,6 @@ tune = Stage(
     _solve_tune,
     TuneOptions,
     writes=("controller",),
-    uses=("camera", "plane", "actuator", "pump", "twin"),
+    uses=("camera", "plane", "lowpass", "actuator", "pump", "twin"),
     plots=later("calib.stages.control.plots", "tune_plots"),
 )

@@ -38,9 +38,9 @@ from calib.stages.control.laws import (
     feed_forward_pwm,
     wanted_motion,
 )
-from calib.stages.control.references import Reference, built_in
+from calib.stages.control.references import Reference, built_in, from_angles
 from calib.stages.control.section import Controller
-from calib.stages.control.tuning import Tracking, tracking
+from calib.stages.control.tuning import Tracking, largest_angle, tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.scenarios import angle_law, at_rest, length_law
 from calib.twin.simulate import Law, Run, Seen, simulate
@@ -81,19 +81,13 @@ def controlled(rig: Rig, limits: Pair | None, other: Rig | None = None) -> tuple
     Parameters
     ----------
     other : a rig whose actuator and pumps the machine has in place of those that controllers know.
-
-    Raises `BadInputError` for another rig whose pumps have another tick.
     """
-    machine = rig_from_file(rig)
+    machine, tick_s = rig_from_file(rig), 1.0 / rig.tick_hz
+    machine = replace(machine, pump=machine.pump.at(tick_s))
     model = control_model(machine, rig.controller, limits)
     if other is not None:
         own = other.machine
-        if own.pump.tick_s != machine.pump.tick_s:
-            raise BadInputError(
-                f"--plant: found pumps with a tick of {1e3 * own.pump.tick_s:.4g} ms, expected the "
-                f"{1e3 * machine.pump.tick_s:.4g} ms of the rig that controllers know"
-            )
-        machine = replace(machine, plant=own.plant, pump=own.pump, strength=own.strength)
+        machine = replace(machine, plant=own.plant, pump=own.pump.at(tick_s), strength=own.strength)
     return machine, model
 
 
@@ -247,6 +241,16 @@ def _tried(
     )
 
 
+def _jump_within(model: Model) -> Reference:
+    """The jump between two angles, both smaller for an actuator that does not bend so far."""
+    jump = built_in(model, "jump")
+    part = _OF_LARGEST * largest_angle(model) / float(jump.phi_rad.max())
+    if part >= 1.0:
+        return jump
+    return replace(from_angles(model, jump.name, part * jump.phi_rad), from_rest=True, jump_s=jump.jump_s)
+
+
+_OF_LARGEST = 0.9
 _TIMES_S = (0.5, 1.0, 2.0, 4.0)
 _SHARES = (0.25, 0.4, 0.7)
 
@@ -259,7 +263,7 @@ def tune_back_calculation(
     Only such settings count whose first step is at 95 % no later than with clamping, a tick apart; where
     there is none the fastest is taken. The true state is fed back, so that noise decides nothing.
     """
-    reference = built_in(model, "jump")
+    reference = _jump_within(model)
     clamped = _jump(rig, model, reference, _orientation(model, reference, replace(pid, clamping=True)))
     plain = _jump(rig, model, reference, _orientation(model, reference, pid))
     found: dict[Pair, dict[str, float]] = {}

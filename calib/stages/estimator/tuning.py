@@ -27,8 +27,6 @@ from calib.stages.estimator.section import Estimator, EstimatorDriven, Estimator
 _MOST_ROWS = 20_000
 _MOST_DRIVEN_ROWS = 6_000
 
-_TICK_HZ = 60.0
-
 
 def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
     """Constant gains at a rate of ticks; None without pictures, or where they are more than 8 ticks late."""
@@ -105,7 +103,7 @@ def tuned_section(
         sigma=sigma,
         levels=[EstimatorLevel(**asdict(level)) for level in found_noise.setup.process.levels],
         driven=driven,
-        constant_gain=gain_section(found_noise.setup, rig.lowpass.rate_hz if rig.lowpass else _TICK_HZ),
+        constant_gain=gain_section(found_noise.setup, rig.tick_hz),
         gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),
         logs=[shown(path.name) for path in logs],
         **judged(Verdict.of(findings)),

@@ -193,6 +193,8 @@ MOST_EARLY_TICKS = 1.0
 """Pictures that are earlier than the IMU by less count as of its time."""
 
 _WHOLE = 1e-6
+_SAME_TICK = 1e-5
+"""A share; a period typed with five digits is meant exactly."""
 _LEVELLING_STEPS = 17
 
 
@@ -251,9 +253,7 @@ def _lowpass(lookup: Lookup) -> list[dict[str, Any]]:
     if lookup.rig.lowpass is None:
         lookup.number("lowpass.cutoff_hz", 1.0)
         # Rounded so that the gain at rest is one, as the sections of rig.yaml are.
-        a1 = float(
-            np.float32(design_lowpass(Design(1.0, lookup.number("lowpass.rate_hz", 60.0))).exact[0, 4])
-        )
+        a1 = float(np.float32(design_lowpass(Design(1.0, lookup.rig.tick_hz)).exact[0, 4]))
         sections = [([0.5 * (1.0 + a1), 0.5 * (1.0 + a1), 0.0], [a1, 0.0])]
     else:
         sections = [(one.b, one.a[1:]) for one in lookup.rig.lowpass.sections]
@@ -455,14 +455,14 @@ def constants(lookup: Lookup, plane: PlaneConstants | None) -> dict[str, Any]:
     """
     nominal = Plant()
     # The control loop runs at the rate of the low-pass.
-    rate_hz = lookup.number("lowpass.rate_hz", 60.0, 1.0, 1000.0)
+    rate_hz = lookup.number("lowpass.rate_hz", lookup.rig.tick_hz, 1.0, 1000.0)
     radius = lookup.number("actuator.bellows_radius_m", nominal.bellows_radius_m)
     rest = lookup.number("actuator.rest_length_m", nominal.rest_length_m)
     tick_s = lookup.number("controller.tick_s", 1.0 / rate_hz)
-    if abs(tick_s * rate_hz - 1.0) > 1e-6:
+    if abs(tick_s * rate_hz - 1.0) > _SAME_TICK:
         raise BadInputError(
             f"{lookup.source}: controller.tick_s is {tick_s:g} s, but the low-pass runs at {rate_hz:g} Hz; "
-            "expected the same tick for both"
+            "expected the same tick for both, run calib control tune again"
         )
     imu, pwm = _imu(lookup, rate_hz), _limits(lookup)
     feed = _feed(lookup, pwm[0])

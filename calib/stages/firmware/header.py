@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
+from statistics import median
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -210,6 +211,8 @@ def _undone(inverse: InverseLens) -> bool:
     return error is not None and error <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
 
 
+_SEEN = 0.8
+"""Pictures per tick; where fewer come the guard's count of lost ones runs full."""
 _WIDE = 4.0
 """Times the default from which on a limit of the envelope is remarked on."""
 
@@ -255,6 +258,15 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
     elif whole.imu is None and whole.align is None:
         text = "neither imu nor align: the board's angle comes from an IMU that nobody has measured"
         findings.append(Finding("poor", text, "run calib imu static and calib align"))
+    logs = [] if whole.align is None else whole.align.logs
+    rates_hz = [one.camera_rate_hz for one in logs if one.camera_rate_hz]
+    seen_hz = median(rates_hz) if rates_hz else whole.tick_hz
+    if seen_hz < _SEEN * whole.tick_hz:
+        text = f"the camera gives {seen_hz:.3g} pictures a second and the board ticks at {whole.tick_hz:g} Hz"
+        text += ": the guard takes a tick without a picture for a lost marker, and stops the pumps"
+        findings.append(
+            Finding("poor", text, "let the board tick at the camera's rate, calib lowpass --rate")
+        )
     if whole.align is not None and whole.align.time_offset_s < 0.0:
         early_ms = -1e3 * whole.align.time_offset_s
         text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"

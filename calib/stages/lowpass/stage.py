@@ -45,9 +45,10 @@ class Options(LogOptions):
         metavar="FREQUENCY",
         parse=partial(parse_frequency_hz, what="--cutoff"),
     )
-    rate_hz: float = option(
-        60.0,
-        "Rate at which the firmware runs the filter. [default: 60Hz]",
+    rate_hz: float | None = option(
+        None,
+        "Rate at which the firmware runs the filter, its tick. [default: the rig's, else 60Hz; "
+        "where the log's camera has another, the camera's]",
         flag="rate",
         metavar="FREQUENCY",
         parse=partial(parse_frequency_hz, what="--rate"),
@@ -101,13 +102,16 @@ class Evidence:
 
 
 def positions_from_log(
-    log: Log, rate_hz: float, on_plane: Callable[[FloatArray], FloatArray] | None = None
+    log: Log,
+    rate_hz: float,
+    on_plane: Callable[[FloatArray], FloatArray] | None = None,
+    set_by_hand: bool = True,
 ) -> Positions:
     """The marker in a log, one position per tick.
 
     Parameters
     ----------
-    rate_hz : of the filter.
+    rate_hz : of the filter. set_by_hand : whether it has to stay; a log of another rate sets it otherwise.
     on_plane : from pixels (n, 2) to metres (n, 2) in the rig's plane; without, positions stay in pixels.
 
     Raises `BadInputError` for a log without camera, with too few samples, whose time runs backwards,
@@ -134,6 +138,8 @@ def positions_from_log(
             raise BadInputError("has no two pictures of the marker at different times, expected a series")
         own = signals.axis.rate_hz
         if abs(own / rate_hz - 1.0) > _RATE_OFF:
+            if not set_by_hand:
+                return positions_from_log(log, signals.axis.nominal_hz, on_plane)
             raise BadInputError(
                 f"has {own:.4g} camera samples/s, expected the {rate_hz:g} Hz that the filter is designed for"
             )
@@ -153,28 +159,33 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
         raise UsageError("--jitter: is for --suggest, which chooses the filter")
     if options.jitter is not None and options.cutoff_hz is not None:
         raise UsageError("--cutoff: does not go with --jitter, from which the cut-off follows")
-    try:
-        order = 1 if options.order is None else options.order
-        design = Design(options.cutoff_hz or 1.0, options.rate_hz, order, options.family or "butterworth")
-        made = design_lowpass(design)
-    except BadInputError as error:
-        raise UsageError(str(error)) from error
     plane, camera = rig.current_plane(files.rig_path), rig.camera
     on_plane = None
     if plane is not None and camera is not None and (options.log or options.suggest):
         on_plane = partial(plane.to_world, camera=camera)
         files.hashes |= rig.identities("camera", "plane")
 
+    rate_hz, set_by_hand = options.rate_hz or rig.tick_hz, options.rate_hz is not None
+
     def positions(path: Path | None) -> Positions | None:
+        nonlocal rate_hz, set_by_hand
         if path is None:
             return None
-        read = positions_from_log(
-            read_log(path, options, files.remarks, rig.picture_px), options.rate_hz, on_plane
-        )
+        log = read_log(path, options, files.remarks, rig.picture_px)
+        read = positions_from_log(log, rate_hz, on_plane, set_by_hand)
+        # A second log has to fit the first.
+        rate_hz, set_by_hand = read.ticks.rate_hz, True
         files.taken(path)
         return read
 
     suggest = positions(options.suggest)
+    shown = suggest if options.log in (None, options.suggest) else positions(options.log)
+    try:
+        order = 1 if options.order is None else options.order
+        design = Design(options.cutoff_hz or 1.0, rate_hz, order, options.family or "butterworth")
+        made = design_lowpass(design)
+    except BadInputError as error:
+        raise UsageError(str(error)) from error
     wanted, unit = options.jitter or (None, "")
     if suggest is not None and wanted is not None and unit != suggest.unit:
         asked = f"{1e3 * wanted:g}mm" if unit == "m" else f"{wanted:g}px"
@@ -183,7 +194,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     return Inputs(
         made,
         rig.workspace_m,
-        suggest if options.log in (None, options.suggest) else positions(options.log),
+        shown,
         suggest,
         wanted,
         () if options.order is None else (options.order,),
@@ -226,7 +237,7 @@ def solve(inputs: Inputs) -> LowPass:
     log = None if positions is None else _log_section(made, positions)
     findings = [*_of_rounding(made, rounded, float_mm)]
     if positions is not None and log is not None:
-        findings += _of_log(log, positions)
+        findings += _of_log(log, positions, choice is not None)
     return LowPass(
         family=cast("Family", design.family),
         order=design.order,
@@ -293,12 +304,12 @@ def _of_rounding(made: Filter, rounded_hz: float, float_mm: float) -> Iterator[F
         yield Finding("poor", f"In single precision the output comes to rest up to {float_mm:.2g} mm away.")
 
 
-def _of_log(log: LowPassLog, positions: Positions) -> Iterator[Finding]:
-    """Findings on what the filter does to a log."""
+def _of_log(log: LowPassLog, positions: Positions, chosen: bool) -> Iterator[Finding]:
+    """Findings on what the filter does to a log; whether it was chosen by its jitter."""
     unsure = [name for name, of in zip(positions.names, positions.spectra, strict=True) if not of.flat]
     if unsure:
         yield Finding(
-            "poor",
+            "poor" if chosen else "remark",
             f"The spectrum of {' and '.join(unsure)} does not fall to a floor: motion and jitter cannot "
             "be told apart; use a log at rest.",
         )
