@@ -16,6 +16,7 @@ from firmware_rigs import header, rig
 from source_model import head_from_marker, inverse_series
 from ticks import Ticks, run_gains
 
+import calib
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import (
@@ -41,7 +42,7 @@ from calib.stages.firmware.conformance import (
     FusedReference,
     Reference,
 )
-from calib.stages.firmware.header import Header
+from calib.stages.firmware.header import Header, header_of
 from calib.stages.firmware.vectors import (
     FUSED_TICKS,
     PERIOD,
@@ -196,6 +197,21 @@ def test_the_self_test_passes_and_sees_a_wrong_constant(
         subprocess.run(call, cwd=tmp_path, check=True)
         codes.append(subprocess.run([tmp_path / "main"], check=False).returncode)
     assert codes == [0, 1]
+
+
+@pytest.mark.parametrize("rate_hz", [12.0, 30.0, 150.0])
+def test_the_self_test_passes_at_other_ticks(tmp_path: Path, rate_hz: float) -> None:
+    """At 15 Hz and below the head turned on beyond what a float follows, and the fused board never ran."""
+    need("gcc")
+    whole = rig("twin")
+    whole = whole.with_sections({"lowpass": calib.lowpass(whole, rate_hz=rate_hz)})
+    write(tmp_path, header_of(whole, "rig.yaml"))
+    main = '#include "calib_selftest.h"\nint main(void) { return calib_selftest() != 0; }\n'
+    (tmp_path / "main.c").write_text(main)
+    for fused in (0, 1):
+        call = ["gcc", "-std=c99", f"-DCALIB_FUSED={fused}", "-o", "main", "main.c", "-lm"]
+        subprocess.run(call, cwd=tmp_path, check=True)
+        assert subprocess.run([tmp_path / "main"], check=False).returncode == 0
 
 
 def test_signs_of_the_imus_axes(tmp_path: Path) -> None:

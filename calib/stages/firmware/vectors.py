@@ -129,12 +129,14 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
         phi = math.atan2(constants["CALIB_IMU_ACCEL_RATIO"] * ay, ax) - constants["CALIB_IMU_MOUNT_ANGLE_RAD"]
         wanted = replace(steady, reference=(phi + e, 0.0), mode=MODE_ORIENTATION)
         made.append((wanted, _TO_LIMIT + 10))
-    # The head turns through both limits of its angle.
-    for rate, ticks in ((-20.0, 8), (20.0, 14)):
+    # The head turns through both limits of its angle, by a third of a radian in a tick.
+    per_60hz = constants["CALIB_TICK_RATE_HZ"] / 60.0
+    fast = 20.0 * min(per_60hz, 1.0)
+    for rate, ticks in ((-fast, 8), (fast, 14)):
         turns = replace(still, gz_radps=rate, reference=(0.3, 0.0), mode=MODE_ORIENTATION)
-        made.append((replace(turns, marker_seen=False), ticks))
+        made.append((replace(turns, marker_seen=False), math.ceil(ticks * max(per_60hz, 1.0))))
     # From there it is nearer to the accelerometer's angle the other way round.
-    made.append((replace(still, ax_mps2=-9.07, ay_mps2=3.74, gz_radps=-20.0), 1))
+    made.append((replace(still, ax_mps2=-9.07, ay_mps2=3.74, gz_radps=-fast), 1))
     return [(binary32(given), times) for given, times in made]
 
 

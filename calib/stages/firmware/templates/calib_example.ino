@@ -151,7 +151,7 @@ static void keep_imu(void) {
         imu_step++;
         imu_failed = 0;
         imu_checked = 0;
-    } else if (imu_checked++ == 60) {
+    } else if (imu_checked++ == CALIB_HOLD_TICKS) {
         imu_checked = 0;
         imu_pause = 6;
         if (!calib_imu_alive()) {
@@ -372,7 +372,7 @@ void loop() {
         return;
     }
     send_picture(picture_us, micros() - picture_us);
-    if (++ticks % 60 == 0) {
+    if (++ticks % CALIB_HOLD_TICKS == 0) {
         send_hello();
     }
 }
