@@ -444,6 +444,19 @@ def test_a_swing_that_hardly_dies_down_is_not_turned_round(sign: float) -> None:
             start(pieces, [log], 0.025)
 
 
+def test_a_twitch_at_the_start_of_a_rest_turns_nothing_round() -> None:
+    """Offsets that put it before the IMU's first sample do not explain it."""
+    for seed in range(6):
+        log = align_log(twin_log(RIG, "static", {}, seed))
+        seen, felt = log.camera_s < 14.0, log.imu_s < 14.0
+        pixels = log.pixels[seen]
+        pixels[2:10, 0] += 24.0 * np.sin(np.pi * np.arange(0.5, 8.0) / 8.0)
+        log = replace(log, camera_s=log.camera_s[seen], pixels=pixels)
+        log = replace(log, imu_s=log.imu_s[felt], readings=log.readings[felt])
+        pieces, _ = pieces_of([log], NUMBERS, MEAN_ALIGN_START)
+        start(pieces, [log], 0.025)
+
+
 SIZE_ALIGNING = RIG.view.camera.image_size_px
 
 

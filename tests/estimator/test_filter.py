@@ -704,7 +704,6 @@ GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "
     ("change", "words"),
     [
         ({"nis": 9.0}, "the innovations of the camera are 4.5 times what the covariance expects"),
-        ({"nis": 0.2}, "the innovations of the camera are 0.1 times"),
         ({"inside": 0.5}, "only 50 % of the camera's innovations lie in their 95 % band"),
         ({"gated": 300}, "25 % of the camera's readings were gated out"),
     ],
@@ -712,6 +711,12 @@ GOOD = {"degrees": 2, "readings": 900, "gated": 2, "nis": 2.1, "inside": 0.95, "
 def test_innovations_that_contradict_their_covariance_are_poor(change: dict[str, float], words: str) -> None:
     found = list(consistent({"camera": SensorCheck(**{**GOOD, **change})}, {}, 1000))
     assert [one.severity for one in found] == ["poor"] and words in found[0].text
+
+
+def test_innovations_smaller_than_expected_are_poor_but_for_a_camera_at_rest() -> None:
+    for name, severity in (("gyro", "poor"), ("camera", "remark")):
+        (one,) = consistent({name: SensorCheck(**{**GOOD, "nis": 0.2})}, {}, 1000)
+        assert one.severity == severity and "are 0.1 times what the covariance expects" in one.text
 
 
 def test_sensors_that_are_gated_out_missing_or_stuck_are_poor() -> None:

@@ -344,8 +344,8 @@ def _normal(
 #
 #     phi_camera(t) = a theta(t - offset) + b + c t,   theta' = -g_z
 #
-# over all stretches with one a; the offset with the least squares is the first guess. The factor a tells
-# a gyroscope in degrees per second (1 / 57) and one that turns the other way round (negative).
+# over all stretches with one a; the offset that leaves the least share of the squares is the first guess. The
+# factor a tells a gyroscope in degrees per second (1 / 57) and one that turns the other way round (negative).
 
 SPLIT_S = 1.0
 SHORTEST_S = 1.0
@@ -524,10 +524,15 @@ def _moments(piece: Piece, offset_s: float) -> FloatArray:
 
 
 def _factors(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Factors a (n,) of the camera's angle by the rate's, and squares left, of moments (n, 3)."""
+    """Factors a (n,) of the camera's angle by the rate's, and the share of its squares left.
+
+    An offset that puts most of the motion outside the IMU's time, as a twitch at the start, leaves all.
+    """
     cross, own, total = sums.T
     factor = np.divide(cross, own, out=np.zeros(len(sums)), where=own > 0.0)
-    return factor, total - factor * cross
+    seen = total > max(0.5 * float(total.max(initial=0.0)), 0.0)
+    explained = np.divide(factor * cross, total, out=np.zeros(len(sums)), where=seen)
+    return factor, 1.0 - explained
 
 
 def correlation(pieces: Sequence[Piece]) -> FloatArray:
@@ -559,10 +564,10 @@ def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     """
     factors, left = _factors(sums)
     total = float(sums[:, 2].max())
-    least = {sign: float(np.min(left[sign * factors > 0.0], initial=total)) for sign in (1.0, -1.0)}
+    least = {sign: float(np.min(left[sign * factors > 0.0], initial=1.0)) for sign in (1.0, -1.0)}
     turned = least[-1.0] < 0.5 * least[1.0]
     best = least[-1.0 if turned else 1.0]
-    if best > 0.5 * total or total - best < _WORTH * _PHI_SIGMA**2:
+    if best > 0.5 or (1.0 - best) * total < _WORTH * _PHI_SIGMA**2:
         return
     factor = float(factors[np.argmin(np.abs(left - best))])
     if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
@@ -740,18 +745,19 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 
     Raises `BadInputError` for a gyroscope in other units or with another sign.
     """
-    sums = np.zeros((len(logs), len(OFFSETS_S), 3))
+    by_log = np.zeros((len(logs), len(OFFSETS_S), 3))
     for piece in pieces:
-        sums[piece.log] += [_moments(piece, offset) for offset in OFFSETS_S.tolist()]
-    for log, own in zip(logs, sums, strict=True):
+        by_log[piece.log] += [_moments(piece, offset) for offset in OFFSETS_S.tolist()]
+    for log, own in zip(logs, by_log, strict=True):
         _check_gyro(log, own)
-    factors, squares = _factors(sums.sum(axis=0))
+    sums = by_log.sum(axis=0)
+    factors, left = _factors(sums)
     usual = int(np.argmin(np.abs(OFFSETS_S - usual_offset_s)))
-    best = int(np.argmin(squares))
-    moves = bool((squares.max() - squares[best]) / _PHI_SIGMA**2 > _WORTH)
+    best = int(np.argmin(left))
+    moves = bool((left.max() - left[best]) * sums[best, 2] / _PHI_SIGMA**2 > _WORTH)
     at = best if moves else usual
-    most = logs[int(np.argmax(sums[:, at, 2]))]
-    _check_gyro(most, sums.sum(axis=0)[at : at + 1])
+    most = logs[int(np.argmax(by_log[:, at, 2]))]
+    _check_gyro(most, sums[at : at + 1])
     offset = float(OFFSETS_S[at])
     made = [_stretch(piece, offset) for piece in pieces]
     stretches = tuple(stretch for stretch in made if stretch is not None)
