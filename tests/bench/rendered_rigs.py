@@ -90,7 +90,7 @@ TARGET_WRONG = (0.10, 0.26, 0.12, 0.15, 0.12)
 WRONG = ("orifice", "hysteresis", "no creep", "heavier", "weaker")
 """Air leaves by an orifice; commands have a play of 8 % of the range; no creep; a head 25 % heavier than the
 drawn one; pumps 15 % weaker."""
-WITH_MASS = ("inertia", "stiffness", "damping", "bending", "lambda2", "strength", "falling")
+WITH_MASS = ("inertia", "stiffness", "bending", "lambda2", "strength", "falling")
 
 
 def drawn(seed: int, off_mm: float = 0.0, wrong: str | None = None) -> SimulatedRig:

@@ -1058,8 +1058,8 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
     for name, sigma in fit.sigma.items():
         value = abs(fit.values[name])
         if name not in _PASSAGE and sigma > _MOST_VAGUE * value:
-            share = f"{100.0 * sigma / max(value, 1e-12):.0f} %"
-            yield Finding("poor", f"{name} of the {better} is known to {share} only")
+            known = f"known to {100.0 * sigma / value:.0f} % only" if sigma < value else "not told by these"
+            yield Finding("poor", f"{name} of the {better} is {known}: {fit.values[name]:.3g} +- {sigma:.2g}")
     settles = found.settles(better)
     if settles is not None:
         level, half, inside, count = settles
