@@ -457,6 +457,16 @@ def test_a_twitch_at_the_start_of_a_rest_turns_nothing_round() -> None:
         start(pieces, [log], 0.025)
 
 
+@pytest.mark.parametrize("more_s", [0.25, 0.7])
+def test_a_stream_that_comes_late_is_aligned(more_s: float) -> None:
+    """Streams over a network show what was half a second ago."""
+    logs = [align_log(twin_log(RIG, kind, {}, 5)) for kind in ("swing", "ellipse")]
+    late = [replace(one, camera_s=one.camera_s + more_s) for one in logs]
+    found = align(late, prior_settings(NUMBERS))
+    assert abs(found.sensor[7] - more_s - RIG.tracker.latency_s) < 4.0 * found.sigma[7] < 2e-3
+    assert judge(found).ok
+
+
 SIZE_ALIGNING = RIG.view.camera.image_size_px
 
 

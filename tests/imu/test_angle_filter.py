@@ -699,9 +699,9 @@ def test_is_the_angle_of_the_arc_whatever_its_length() -> None:
     assert np.allclose(angle_from_marker(_markers(phi, length)), phi, atol=1e-12)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.0173, 0.035])
+@pytest.mark.parametrize("lag", [0.0, 0.0173, 0.035, 0.4321])
 def test_finds_the_lag(lag: float) -> None:
     rng = np.random.default_rng(1)
     t, seen = 0.01 * np.arange(2000), np.arange(0.0, 20.0, 1.0 / 60.0)
     late = _motion(seen - lag) + 0.4 + 0.003 * rng.normal(size=len(seen))
-    assert lag_of(seen, late, t, _motion(t)) == pytest.approx(lag, abs=1e-3)
+    assert lag_of(seen, late, t, _motion(t), _motion(t) + 0.01 * t) == pytest.approx(lag, abs=1e-3)

@@ -439,7 +439,7 @@ class Problem:
             ]
             delays.append(before[0] if before else len(rows))
             if not before:
-                rows.append((0.01, -0.5, 0.5, self.delay_s, _DELAY_SIGMA_S))
+                rows.append((0.01, self.delay_s - 0.5, self.delay_s + 0.5, self.delay_s, _DELAY_SIGMA_S))
         starts = []
         for track in self.tracks:
             at, moving = len(rows), track.moving is not None

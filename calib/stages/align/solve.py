@@ -351,7 +351,7 @@ SPLIT_S = 1.0
 SHORTEST_S = 1.0
 """Gaps at which a log is split, and stretches that are too short to be used."""
 
-OFFSETS_S = np.arange(-0.1, 0.3001, 0.0025)
+OFFSETS_S = np.arange(-0.1, 0.8001, 0.0025)
 """Time offsets (k,) among which the first guess is."""
 _LEAST_PICTURES = 20
 _START_LEAST_SAMPLES = 40
@@ -1210,7 +1210,8 @@ def _contradicted(found: Alignment) -> Iterator[Finding]:
             "poor",
             "pictures contradict the IMU: they miss the fit in the same way from one to the next, "
             f"correlation {correlation:.2f}",
-            "check the columns of the logs: their order, signs, units and times",
+            "check the columns of the logs: their order, signs, units and times; delays are looked for from "
+            f"{OFFSETS_S[0]:.1f} to {OFFSETS_S[-1]:.1f} s",
         )
 
 
@@ -1236,7 +1237,8 @@ def _known(found: Alignment) -> Iterator[Finding]:
         )
     for k, name in enumerate(SENSOR):
         away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
-        if away > _BEYOND_PRIOR:
+        # A delay that the logs tell is a delay, however long.
+        if away > _BEYOND_PRIOR and (k != _OFFSET or offset > _OFFSET_S[0]):
             text = f"{QUANTITIES[name].words} came out as {found.sensor[k]:.3g}, which is not to be expected"
             yield Finding("poor", text)
 

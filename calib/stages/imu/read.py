@@ -95,8 +95,10 @@ def _of(log: Log, signals: Signals, *findings: Finding) -> Readings:
 # whatever the length. Pictures come late; by how much follows from the log: the lag is the one at which
 # the camera's angle differs least from another angle of the same log.
 
-_LAGS_S = np.arange(-0.02, 0.1201, 0.001)
+_LAGS_S, _LONG_LAGS_S = np.arange(-0.02, 0.1201, 0.001), np.arange(-0.02, 0.8001, 0.005)
 _FEWEST = 30
+_CLEAR = 0.25
+"""Share of a camera's angle that a long lag leaves, at most."""
 
 
 def angle_from_marker(marker_m: FloatArray) -> FloatArray:
@@ -105,23 +107,57 @@ def angle_from_marker(marker_m: FloatArray) -> FloatArray:
     return np.asarray(2.0 * np.arctan2(x, y + MARKER_OFFSET_M))
 
 
-def lag_of(late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray) -> float:
-    """By how much [s] one angle (m,) is later than another (n,), from -20 to 120 ms; 0 for standing still.
+def _about(at: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:
+    """The lag [s], to 5 ms, at which the gyroscope's angle leaves the least share, but for a line in time.
+
+    0 where that is a usual one, or explains the angle hardly better.
+    """
+    left = []
+    for lag in _LONG_LAGS_S.tolist():
+        inside = (at - lag > t_s[0]) & (at - lag < t_s[-1])
+        left.append(1.0)
+        # A lag that puts most of the motion outside the IMU's time explains none of it.
+        if int(inside.sum()) < _FEWEST or late_rad[inside].var() <= 0.5 * late_rad.var():
+            continue
+        t, seen = at[inside], late_rad[inside]
+        line = np.stack([np.ones(len(t)), t - t.mean()], axis=1)
+        norms = (line * line).sum(axis=0)
+        turned, seen = (
+            one - line @ (line.T @ one / norms) for one in (np.interp(t - lag, t_s, turned_rad), seen)
+        )
+        # Of a swing a period early the rest has the same shape and is larger.
+        left[-1] = float(((seen - turned) ** 2).sum() / (seen**2).sum())
+    k, usual = int(np.argmin(left)), min(left[: int(np.searchsorted(_LONG_LAGS_S, _LAGS_S[-1]))])
+    return float(_LONG_LAGS_S[k]) if left[k] < min(_CLEAR, 0.5 * usual) else 0.0
+
+
+def lag_of(
+    late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray, turned_rad: FloatArray
+) -> float:
+    """By how much [s] one angle (m,) is later than another (n,), from -20 to 800 ms; 0 for standing still.
 
     The lag of least variance of the difference; between the two neighbours it is that of the parabola.
+
+    Parameters
+    ----------
+    turned_rad : (n,) what the gyroscope has turned, which says where to look.
     """
-    known = np.isfinite(late_rad) & (late_t_s > t_s[0] + 0.13) & (late_t_s < t_s[-1] - 0.03)
+    seen = np.isfinite(late_rad)
+    at, late = late_t_s[seen], late_rad[seen]
+    middle = _about(at, late, t_s, turned_rad)
+    lags = middle + _LAGS_S[:41] if middle else _LAGS_S
+    known = (at > t_s[0] + float(lags[-1]) + 0.01) & (at < t_s[-1] - 0.03)
     if int(known.sum()) < _FEWEST:
-        return 0.0
-    at, late = late_t_s[known], late_rad[known]
-    variance = np.array([float((late - np.interp(at - lag, t_s, phi_rad)).var()) for lag in _LAGS_S.tolist()])
+        return middle
+    at, late = at[known], late[known]
+    variance = np.array([float((late - np.interp(at - lag, t_s, phi_rad)).var()) for lag in lags.tolist()])
     k = int(np.argmin(variance))
     # A minimum at the end, or one that stands out by nothing, tells no lag.
-    if k in (0, len(_LAGS_S) - 1) or float(variance.max()) < 1.02 * float(variance[k]):
-        return 0.0
+    if k in (0, len(lags) - 1) or float(variance.max()) < 1.02 * float(variance[k]):
+        return middle
     a, b, c = variance[k - 1 : k + 2].tolist()
     bend = a - 2.0 * b + c
-    return float(_LAGS_S[k] + (0.5 * 0.001 * (a - c) / bend if bend > 0.0 else 0.0))
+    return float(lags[k] + (0.5 * 0.001 * (a - c) / bend if bend > 0.0 else 0.0))
 
 
 def drift_log(log: Log) -> Readings:
@@ -242,10 +278,10 @@ def _lag(
     k = max(range(len(parts)), key=lambda i: len(parts[i].values))
     part, rate = parts[k], rates[k]
     t = part.t_s
-    own = integral(t, rate)
+    turned = own = integral(t, rate)
     if len(rate) * period_s >= SHORTEST_S + period_s:
         own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk).phi_rad
-    return lag_of(late_t_s, np.unwrap(late_rad), t, own)
+    return lag_of(late_t_s, np.unwrap(late_rad), t, own, turned)
 
 
 def tune_log(log: Log, how: Reading) -> TuneLog:
