@@ -97,6 +97,7 @@ def _of(log: Log, signals: Signals, *findings: Finding) -> Readings:
 
 _LAGS_S, _LONG_LAGS_S = np.arange(-0.02, 0.1201, 0.001), np.arange(-0.02, 0.8001, 0.005)
 _FEWEST = 30
+_LEAST_MOTION_RAD2 = 1e-6
 _CLEAR = 0.25
 """Share of a camera's angle that a long lag leaves, at most."""
 
@@ -126,7 +127,7 @@ def _about(at: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: Fl
             one - line @ (line.T @ one / norms) for one in (np.interp(t - lag, t_s, turned_rad), seen)
         )
         # Of a swing a period early the rest has the same shape and is larger.
-        left[-1] = float(((seen - turned) ** 2).sum() / (seen**2).sum())
+        left[-1] = float(((seen - turned) ** 2).sum() / max((seen**2).sum(), _LEAST_MOTION_RAD2))
     k, usual = int(np.argmin(left)), min(left[: int(np.searchsorted(_LONG_LAGS_S, _LAGS_S[-1]))])
     return float(_LONG_LAGS_S[k]) if left[k] < min(_CLEAR, 0.5 * usual) else 0.0
 
