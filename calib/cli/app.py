@@ -33,6 +33,7 @@ _VERBS = [
     "sweep",
     "record",
     "track",
+    "join",
     "convert",
     "board",
     "simulate",

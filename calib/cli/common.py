@@ -13,11 +13,11 @@ from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
-from calib.core.errors import CalibError, ReaderGoneError
-from calib.core.files import one_line
+from calib.core.errors import CalibError, ReaderGoneError, UsageError
+from calib.core.files import one_line, shown
 from calib.core.stage import ProgressCall, finite
 from calib.core.words import Table, as_text
-from calib.core.writing import stdout_is_taken
+from calib.core.writing import stdout_is_taken, writes_through
 
 # ----------------------------------------------------------------------
 # Telling a person who waits that functions are being compiled.
@@ -51,6 +51,12 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON documen
 FiguresOption = Annotated[
     Path | None, typer.Option("--figures", help="Folder to draw figures into, made if needed.")
 ]
+
+
+def check_log_name(output: Path) -> None:
+    """Raise `UsageError` for a name that a log cannot have."""
+    if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
+        raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
 
 
 def narrate(message: str) -> None:

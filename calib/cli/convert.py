@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, answer, narrate, progress_bar
+from calib.cli.common import JsonOption, answer, check_log_name, narrate, progress_bar
 from calib.cli.verbs import of_logs
 from calib.core.command import note_inputs
-from calib.core.errors import BadInputError, UsageError
+from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
-from calib.core.writing import check_writable, write_atomically, writes_through
+from calib.core.writing import check_writable, write_atomically
 
 
 @of_logs
@@ -38,8 +38,7 @@ def convert(
     from calib.io.logs import LOG, beside, iter_log, refuse_counts, within
     from calib.io.states import states_writer
 
-    if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
-        raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
+    check_log_name(output)
     note_inputs([log, *beside(log), *(path for path in (stated.columns, stated.topics) if path is not None)])
     check_writable(output, LOG)
     if save_columns is not None:

@@ -282,3 +282,21 @@ def test_a_port_that_is_not_there(calib, tmp_path: Path) -> None:
     ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "log.csv")
     assert ended.code == 3
     assert "ttyNone: cannot be opened" in ended.sentence
+
+
+def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
+    (tmp_path / "track.csv").write_text("t_s,u_px,v_px,sigma_px\n0.005,1,2,0.1\n0.02,3,4,0.1\n9,5,6,0.1\n")
+    (tmp_path / "board.csv").write_text("t_s,gz_radps,pwm1,pwm2\n0,0.1,0,0\n0.01,0.2,,\n0.02,0.3,9,9\n")
+    words = ("join", "track.csv", "board.csv", "--same-clock", "-o")
+    ended = calib(*words, "log.csv", cwd=tmp_path)
+    assert ended.code == 0 and "1 pictures are outside the IMU's time, and left out" in ended.err
+    assert (tmp_path / "log.csv").read_text() == (
+        "t_s,u_px,v_px,gz_radps,pwm1,pwm2\n0.000000,,,0.1,0,0\n0.005000,1,2,,,\n"
+        "0.010000,,,0.2,,\n0.020000,3,4,,,\n0.020000,,,0.3,9,9\n"
+    )
+    for target, code, words_of in (("board.csv", 3, "is an input"), ("log.txt", 2, "")):
+        ended = calib(*words, target, cwd=tmp_path)
+        assert ended.code == code and words_of in ended.err
+    ended = calib("join", "track.csv", "board.csv", "-o", "other.csv", cwd=tmp_path)
+    assert ended.code == 3 and "do not tell one offset" in ended.err
+    assert not (tmp_path / "other.csv").exists()

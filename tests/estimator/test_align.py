@@ -15,6 +15,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log, unclipped
+from calib.stages.align.join import joined
 from calib.stages.align.read import settings_from_rig
 from calib.stages.align.solve import (
     AlignLog,
@@ -564,3 +565,59 @@ def test_sigma_grows_where_the_marker_is_not_where_it_was_drawn() -> None:
         mean = (sensor[at] * room + drawn.marker_offset_m * own**2) / (own**2 + room)
         firm.append((mean - true) ** 2 * (1.0 / room + 1.0 / own**2))
     assert np.mean(mixed) < 0.2 * np.mean(firm)
+
+
+def _apart(log: Log, offset_s: float) -> tuple[Log, Log]:
+    """The pictures of a log on a clock of their own, and the rest."""
+    seen, felt = log.sampled("u_px", "v_px"), log.sampled("gz_radps")
+    pixels = {name: log.columns[name][seen] for name in ("u_px", "v_px")}
+    rest = {name: log.columns[name][felt] for name in ("gz_radps", "ax_mps2", "ay_mps2")}
+    return (
+        Log("track.csv", log.t_s[seen] - offset_s, pixels, np.arange(len(seen))),
+        Log("board.csv", log.t_s[felt], rest, np.arange(len(felt))),
+    )
+
+
+@pytest.mark.parametrize("offset_s", [-40.0, 1234.567])
+@pytest.mark.parametrize(
+    ("kind", "with_plane", "told"),
+    [
+        ("swing", True, True),
+        ("swing", False, False),
+        ("prbs", True, True),
+        ("prbs", False, True),
+        ("static", True, False),
+        ("ellipse", True, False),
+    ],
+)
+def test_two_logs_are_joined_by_the_motion_that_both_saw(
+    offset_s: float, kind: str, with_plane: bool, told: bool
+) -> None:
+    """A swing without a plane is the same a period later; rest and slow motion say nothing."""
+    camera, board = _apart(twin_log(RIG, kind, {}, 3), offset_s)
+    rig = _rig_file() if with_plane else Rig()
+    if not told:
+        with pytest.raises(BadInputError, match=r"track\.csv: its motion and that of board\.csv"):
+            joined(camera, board, rig, "rig.yaml", False)
+        return
+    log, found, outside = joined(camera, board, rig, "rig.yaml", False)
+    assert found is not None
+    assert found.offset_s == pytest.approx(offset_s - RIG.tracker.latency_s, abs=5e-3)
+    assert len(log) == len(camera) + len(board) - outside and outside < 5
+    assert (np.diff(log.t_s) >= 0.0).all()
+    for name, one in {**dict.fromkeys(camera.columns, camera), **dict.fromkeys(board.columns, board)}.items():
+        there = log.sampled(name)
+        first = len(one) - len(there)
+        assert first <= outside
+        np.testing.assert_array_equal(log.columns[name][there], one.columns[name][first:])
+
+
+def test_logs_of_one_clock_are_merged_as_they_are() -> None:
+    camera, board = _apart(twin_log(RIG, "static", {}, 3), 0.0)
+    log, found, outside = joined(camera, board, Rig(), "rig.yaml", True)
+    assert found is None and outside <= 1
+    assert set(camera.t_s[outside:]) <= set(log.t_s)
+    with pytest.raises(BadInputError, match=r"board\.csv: has no pictures"):
+        joined(board, board, Rig(), "rig.yaml", True)
+    with pytest.raises(BadInputError, match="none of its pictures is within the time"):
+        joined(replace(camera, t_s=camera.t_s + 1e6), board, Rig(), "rig.yaml", True)

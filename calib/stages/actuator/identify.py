@@ -1160,7 +1160,8 @@ def uncertainty(solution: Solution) -> Uncertainty:
     white = inverse[:P, :P] * max(spread, 1.0)
     ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(white), 1e-300), 1.0))
     covariance = white * np.outer(ratio, ratio)
-    sigma = np.sqrt(np.diag(covariance))
+    # What moves no residual at all is not known exactly, but not at all.
+    sigma = np.where(np.diag(H)[:P] > 0.0, np.sqrt(np.diag(covariance)), np.inf)
     return Uncertainty(
         dict(zip(problem.names, sigma.tolist(), strict=True)),
         dict(zip(problem.names, ratio.tolist(), strict=True)),

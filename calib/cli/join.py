@@ -1,0 +1,55 @@
+"""`calib join`: the log of a camera and that of a board with an IMU as one log, on one clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from calib.cli.common import JsonOption, RigOption, answer, check_log_name, narrate
+from calib.core.command import note_inputs
+from calib.core.files import shown
+from calib.core.writing import check_writable
+
+
+def join(
+    camera: Annotated[Path, typer.Argument(help="Log with the marker, as calib track writes it.")],
+    board: Annotated[Path, typer.Argument(help="Log with the IMU, and what else a board records.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv or .parquet.")],
+    same_clock: Annotated[
+        bool, typer.Option("--same-clock", help="Both have one clock already; nothing is looked for.")
+    ] = False,
+    rig: RigOption = Path("rig.yaml"),
+    as_json: JsonOption = False,
+) -> None:
+    """Write the log of a camera and that of an IMU as one, with the pictures' times on the IMU's clock.
+
+    Finds how the clocks stand to each other by the motion that both saw, whatever the offset. With camera and
+    plane in the rig's file the marker's way is an angle, and one swing suffices; without, move unevenly.
+    """
+    from calib.core.rig import Rig
+    from calib.io.logs import LOG, beside, read_log, write_log
+    from calib.stages.align.join import DRIFT_S, joined
+
+    check_log_name(output)
+    note_inputs([camera, board, *beside(camera), *beside(board)])
+    check_writable(output, LOG)
+    known = Rig.load(rig, missing_ok=True)
+    log, clocks, outside = joined(read_log(camera), read_log(board), known, shown(rig), same_clock)
+    write_log(output, log)
+    told: dict[str, Any] = {"log": shown(output), "rows": len(log), "outside": outside}
+    lines = [f"{len(log)} rows written to {shown(output)}: t_s, {', '.join(log.columns)}"]
+    if clocks is not None:
+        told |= {"offset_s": clocks.offset_s, "drift_s": clocks.drift_s, "left": clocks.left}
+        told["next_left"] = clocks.next_left
+        left = f"leaves {clocks.left:.0%} of the motion, the next best {clocks.next_left:.0%}"
+        lines.insert(0, f"pictures' clock and {clocks.offset_s:.3f} s is the IMU's: it {left}")
+        lines.append("calib align finds the rest of the offset")
+    answer(as_json, "join", {"join": told}, *lines)
+    if outside:
+        narrate(f"{outside} pictures are outside the IMU's time, and left out")
+    if clocks is not None and clocks.drift_s is not None and abs(clocks.drift_s) > DRIFT_S:
+        narrate(
+            f"the clocks drift by {1e3 * clocks.drift_s:.0f} ms between the halves; join shorter recordings"
+        )
