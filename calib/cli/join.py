@@ -48,7 +48,7 @@ def join(
         lines.append("calib align finds the rest of the offset")
     answer(as_json, "join", {"join": told}, *lines)
     if outside:
-        narrate(f"{outside} pictures are outside the IMU's time, and left out")
+        narrate(f"pictures outside the IMU's time, which are left out: {outside}")
     if clocks is not None and clocks.drift_s is not None and abs(clocks.drift_s) > DRIFT_S:
         narrate(
             f"the clocks drift by {1e3 * clocks.drift_s:.0f} ms between the halves; join shorter recordings"

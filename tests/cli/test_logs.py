@@ -289,7 +289,7 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     (tmp_path / "board.csv").write_text("t_s,gz_radps,pwm1,pwm2\n0,0.1,0,0\n0.01,0.2,,\n0.02,0.3,9,9\n")
     words = ("join", "track.csv", "board.csv", "--same-clock", "-o")
     ended = calib(*words, "log.csv", cwd=tmp_path)
-    assert ended.code == 0 and "1 pictures are outside the IMU's time, and left out" in ended.err
+    assert ended.code == 0 and "pictures outside the IMU's time, which are left out: 1" in ended.err
     assert (tmp_path / "log.csv").read_text() == (
         "t_s,u_px,v_px,gz_radps,pwm1,pwm2\n0.000000,,,0.1,0,0\n0.005000,1,2,,,\n"
         "0.010000,,,0.2,,\n0.020000,3,4,,,\n0.020000,,,0.3,9,9\n"
