@@ -9,9 +9,9 @@ from scipy.signal import correlate
 
 from calib.core.arrays import BoolArray, FloatArray, integral
 from calib.core.errors import BadInputError
-from calib.core.rig import Rig
+from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log
-from calib.stages.actuator.kinematics import MARKER_OFFSET_M
+from calib.stages.imu.read import angle_from_marker
 
 # ----------------------------------------------------------------------
 # Both saw the head turn: the camera its angle phi (or, without a plane, the marker's way along its main
@@ -121,10 +121,10 @@ def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, 
     if plane is None or rig.camera is None:
         moved = pictures.values - pictures.values.mean(axis=0)
         return pictures.t_s, moved @ np.linalg.svd(moved, full_matrices=False)[2][0], False
-    x, y = plane.to_world(pictures.values, rig.camera).T
-    d = MARKER_OFFSET_M if rig.geometry is None else rig.geometry.marker_offset_m
-    fine = np.isfinite(x + y)
-    return pictures.t_s[fine], 2.0 * np.arctan2(x, y + d)[fine], True
+    marker = plane.to_world(pictures.values, rig.camera)
+    phi = angle_from_marker(marker, (rig.geometry or Geometry()).marker_offset_m)
+    fine = np.isfinite(phi)
+    return pictures.t_s[fine], phi[fine], True
 
 
 def joined(

@@ -102,10 +102,10 @@ _CLEAR = 0.25
 """Share of a camera's angle that a long lag leaves, at most."""
 
 
-def angle_from_marker(marker_m: FloatArray) -> FloatArray:
-    """Bending angle phi (n,) [rad] of marker positions (n, 2) in the plane [m]."""
+def angle_from_marker(marker_m: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
+    """Bending angle phi (n,) [rad] of markers (n, 2) in the plane [m], `offset_m` beyond the head."""
     x, y = marker_m.T
-    return np.asarray(2.0 * np.arctan2(x, y + MARKER_OFFSET_M))
+    return np.asarray(2.0 * np.arctan2(x, y + offset_m))
 
 
 def _about(at: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:

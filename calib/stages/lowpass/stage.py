@@ -138,11 +138,12 @@ def positions_from_log(
             raise BadInputError("has no two pictures of the marker at different times, expected a series")
         own = signals.axis.rate_hz
         if abs(own / rate_hz - 1.0) > _RATE_OFF:
-            if not set_by_hand:
-                return positions_from_log(log, signals.axis.nominal_hz, on_plane)
-            raise BadInputError(
-                f"has {own:.4g} camera samples/s, expected the {rate_hz:g} Hz that the filter is designed for"
-            )
+            if set_by_hand:
+                raise BadInputError(
+                    f"has {own:.4g} camera samples/s, expected the {rate_hz:g} Hz that the filter is "
+                    "designed for"
+                )
+            rate_hz = signals.axis.nominal_hz
         ticks = on_ticks(signals.t_s, values, rate_hz)
         piece = ticks.longest.values
         spectra = (spectrum(piece[:, 0], rate_hz), spectrum(piece[:, 1], rate_hz))
