@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from source_model import pose_from_configuration
 
 from calib import simulate
-from calib.stages.actuator.kinematics import marker_from_head
+from calib.stages.actuator.kinematics import angle_from_marker, marker_from_head
 from calib.stages.imu.levelling import Levelling, level_three, system
 from calib.stages.imu.mahony import (
     Mahony,
@@ -38,7 +38,7 @@ from calib.stages.imu.mahony import (
     filter_log,
     wrapped,
 )
-from calib.stages.imu.read import angle_from_marker, drift_log, lag_of
+from calib.stages.imu.read import drift_log
 from calib.stages.imu.sampling import AXES
 from calib.stages.imu.tracks import PEERS, missing, planar_rate, run_peer
 from calib.stages.imu.tuning import (
@@ -684,24 +684,9 @@ def test_whatever_is_recommended_on_real_recordings_is_better(shared_data: Path)
     assert sum(ratio < 0.8 for ratio in ratios) >= 8
 
 
-def _markers(phi: np.ndarray, length: np.ndarray) -> np.ndarray:
-    pose = pose_from_configuration(np.stack([phi / length, length], axis=-1))
-    return marker_from_head(pose[:, :2], phi)
-
-
-def _motion(t: np.ndarray) -> np.ndarray:
-    return 0.3 * np.sin(2.0 * t) + 0.1 * np.sin(7.0 * t)
-
-
 def test_is_the_angle_of_the_arc_whatever_its_length() -> None:
     rng = np.random.default_rng(0)
     phi, length = rng.uniform(-1.5, 1.5, 200), rng.uniform(0.06, 0.1, 200)
-    assert np.allclose(angle_from_marker(_markers(phi, length)), phi, atol=1e-12)
-
-
-@pytest.mark.parametrize("lag", [0.0, 0.0173, 0.035, 0.4321])
-def test_finds_the_lag(lag: float) -> None:
-    rng = np.random.default_rng(1)
-    t, seen = 0.01 * np.arange(2000), np.arange(0.0, 20.0, 1.0 / 60.0)
-    late = _motion(seen - lag) + 0.4 + 0.003 * rng.normal(size=len(seen))
-    assert lag_of(seen, late, t, _motion(t), _motion(t) + 0.01 * t) == pytest.approx(lag, abs=1e-3)
+    head = pose_from_configuration(np.stack([phi / length, length], axis=-1))[:, :2]
+    for offset in (0.015, 0.03):
+        assert np.allclose(angle_from_marker(marker_from_head(head, phi, offset), offset), phi, atol=1e-12)

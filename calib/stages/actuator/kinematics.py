@@ -233,6 +233,15 @@ def marker_from_head(head_m: FloatArray, phi: FloatArray, offset_m: float = MARK
     return np.asarray(head_m, dtype=np.float64) + _along_tangent(phi, offset_m)
 
 
+def angle_from_marker(marker_m: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
+    """Bending angle phi (n,) [rad] of markers (n, 2) [m]: tan(phi / 2) = x / (y + d), whatever the length.
+
+    The chord to the head has half of the head's angle (3.10), and the marker lies d beyond it (A.1).
+    """
+    x, y = marker_m.T
+    return np.asarray(2.0 * np.arctan2(x, y + offset_m))
+
+
 # ----------------------------------------------------------------------
 # The truncated series of the firmware for the inverse kinematics (3.14):
 #

@@ -2,116 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.signal import correlate
 
-from calib.core.arrays import BoolArray, FloatArray, integral
+from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log
-from calib.stages.imu.read import angle_from_marker
+from calib.solve.delay import Clocks, clocks
+from calib.stages.actuator.kinematics import angle_from_marker
 
-# ----------------------------------------------------------------------
-# Both saw the head turn: the camera its angle phi (or, without a plane, the marker's way along its main
-# direction), the gyroscope its rate. Both are differenced over `_OVER` steps of a grid and held against each
-# other at all lags,
-#
-#     left(lag) = sum (r_camera(t) - r_imu(t + lag))^2 / sum r_camera(t)^2,
-#
-# over the time that both share there; of the marker's way, whose scale nobody knows, after the best factor.
-# A lag at which more than half of motion or time lies outside the IMU's says nothing. A swing repeats after
-# each period but for its size, so that the next best lag has to leave twice as much.
-
-_STEP_S, _OVER = 0.01, 10
-_GAP_S = 0.15
-_MOST_LEFT, _APART = 0.4, 0.5
-"""Share of the motion that may be left, and of what the next best lag leaves."""
-_BESIDE_S = 0.1
 _LONGEST_S = 6.0 * 3600.0
 DRIFT_S = 0.004
 """Between the halves of a recording, beyond which it is told."""
-
-
-@dataclass(frozen=True)
-class Clocks:
-    """How two clocks stand to each other.
-
-    Attributes
-    ----------
-    offset_s : to be added to the pictures' times. drift_s : by how much more in the second half than in the
-        first; None where one of them does not tell.
-    left, next_left : shares of the motion that are left at this offset, and at the next best one.
-    """
-
-    offset_s: float
-    drift_s: float | None
-    left: float
-    next_left: float
-
-
-def _on_grid(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Times of a grid, rates there, and whether they are between samples that are close together."""
-    at = np.arange(t_s[0], t_s[-1], _STEP_S)
-    after = np.clip(np.searchsorted(t_s, at, side="right"), 1, len(t_s) - 1)
-    near = t_s[after] - t_s[after - 1] < _GAP_S
-    smooth = np.interp(at, t_s, values)
-    rate = (smooth[_OVER:] - smooth[:-_OVER]) / (_OVER * _STEP_S)
-    middle = _OVER // 2
-    return at[middle : middle + len(rate)], rate, near[_OVER:] & near[:-_OVER]
-
-
-def _shares(seen: FloatArray, known: BoolArray, felt: FloatArray, scaled: bool) -> FloatArray:
-    """left (n,) at the lags 1 - len(seen) .. len(felt) - 1 of grids; 1 where too little is shared."""
-    seen = np.where(known, seen - seen[known].mean(), 0.0)
-    both = correlate(felt, seen)
-    there, rows = np.ones(len(felt)), known.astype(np.float64)
-    own, other = correlate(there, seen**2), correlate(felt**2, rows)
-    enough = (own > 0.5 * float((seen**2).sum())) & (correlate(there, rows) > 0.5 * float(rows.sum()))
-    off = (
-        own - 2.0 * both + other
-        if scaled
-        else own - np.divide(both**2, other, out=0.0 * own, where=other > 0)
-    )
-    return np.asarray(np.divide(np.maximum(off, 0.0), own, out=np.ones(len(own)), where=enough))
-
-
-def clocks(
-    camera_s: FloatArray, way: FloatArray, imu_s: FloatArray, gz_radps: FloatArray, scaled: bool
-) -> Clocks | None:
-    """How two clocks stand to each other by a motion that both saw; None where it does not tell.
-
-    Parameters
-    ----------
-    camera_s, way : (n,) times and angle phi [rad], or with `scaled` False any measure of the motion.
-    imu_s, gz_radps : (m,) times and rates.
-    """
-    at, seen, known = _on_grid(camera_s, way)
-    felt_s, felt, _ = _on_grid(imu_s, -integral(imu_s, gz_radps - np.median(gz_radps)))
-    if known.sum() < 10 * _OVER or len(felt) < 10 * _OVER:
-        return None
-
-    def offset(known: BoolArray) -> tuple[float, float, float]:
-        left = _shares(seen, known, felt, scaled)
-        k = int(np.argmin(left))
-        beside = round(_BESIDE_S / _STEP_S)
-        others = np.concatenate([left[: max(k - beside, 0)], left[k + beside + 1 :], [1.0]])
-        part = 0.0
-        if 0 < k < len(left) - 1:
-            a, b, c = left[k - 1 : k + 2].tolist()
-            part = 0.5 * (a - c) / (a - 2.0 * b + c) if a - 2.0 * b + c > 0.0 else 0.0
-        lag_s = (k + part - (len(seen) - 1)) * _STEP_S
-        return lag_s + float(felt_s[0] - at[0]), float(left[k]), float(others.min())
-
-    whole, left, following = offset(known)
-    if left > min(_MOST_LEFT, _APART * following):
-        return None
-    first = np.arange(len(at)) < len(at) // 2
-    parts = (known & first, known & ~first)
-    halves = [offset(part) for part in parts if part.sum() >= 10 * _OVER]
-    clear = len(halves) == 2 and all(one[1] <= min(_MOST_LEFT, _APART * one[2]) for one in halves)
-    return Clocks(whole, halves[1][0] - halves[0][0] if clear else None, left, following)
 
 
 def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, bool]:

@@ -17,6 +17,7 @@ from calib.core.result import finite_or_none
 from calib.core.rig import Geometry
 from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import TimeAxis, time_axis
+from calib.solve.delay import moments, shares, vertex
 from calib.solve.groups import tied_groups
 from calib.stages.align.section import LogCheck
 from calib.stages.align.spline import (
@@ -117,9 +118,8 @@ def best_jitter_px(off: FloatArray, grid: float, share: float, area: float) -> f
     k = near[at]
     if not 0 < k < last:
         return float(_JITTERS_PX[k])
-    a, b, c = losses[at - 1 : at + 2]
     step = math.log(_JITTERS_PX[1] / _JITTERS_PX[0])
-    return float(_JITTERS_PX[k] * math.exp(0.5 * step * (a - c) / (a - 2.0 * b + c)))
+    return float(_JITTERS_PX[k] * math.exp(step * vertex(*losses[at - 1 : at + 2])))
 
 
 def imu_terms(off: FloatArray, noise: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -508,33 +508,6 @@ def _use(piece: Piece, offset_s: float) -> BoolArray:
     return np.asarray(inside & piece.fine)
 
 
-def _moments(piece: Piece, offset_s: float) -> FloatArray:
-    """Sums (3,) of theta phi, theta^2 and phi^2 at this offset, each about its straight line."""
-    sums = np.zeros(3)
-    use = _use(piece, offset_s)
-    if use.sum() >= _LEAST_PICTURES:
-        t = piece.camera.t_s[use]
-        theta = np.interp(t - offset_s, piece.imu.t_s, piece.theta)
-        line = np.stack([np.ones(len(t)), t - t.mean()], axis=1)
-        norms = (line * line).sum(axis=0)
-        theta = theta - line @ (line.T @ theta / norms)
-        phi = piece.phi[use] - line @ (line.T @ piece.phi[use] / norms)
-        sums[:] = theta @ phi, theta @ theta, phi @ phi
-    return sums
-
-
-def _factors(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Factors a (n,) of the camera's angle by the rate's, and the share of its squares left.
-
-    An offset that puts most of the motion outside the IMU's time, as a twitch at the start, leaves all.
-    """
-    cross, own, total = sums.T
-    factor = np.divide(cross, own, out=np.zeros(len(sums)), where=own > 0.0)
-    seen = total > max(0.5 * float(total.max(initial=0.0)), 0.0)
-    explained = np.divide(factor * cross, total, out=np.zeros(len(sums)), where=seen)
-    return factor, 1.0 - explained
-
-
 def correlation(pieces: Sequence[Piece]) -> FloatArray:
     """Correlation (k,) of the camera's rate, over four frames, with the gyroscope's at `OFFSETS_S`."""
     values = []
@@ -562,7 +535,7 @@ def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     `sums` (n, 3) are its moments at some offsets. Half a period late a swing turns the other way round: it
     counts as turned where no offset of the other sign explains it half as well.
     """
-    factors, left = _factors(sums)
+    factors, left = shares(sums, scaled=False)
     total = float(sums[:, 2].max())
     least = {sign: float(np.min(left[sign * factors > 0.0], initial=1.0)) for sign in (1.0, -1.0)}
     turned = least[-1.0] < 0.5 * least[1.0]
@@ -747,11 +720,14 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
     """
     by_log = np.zeros((len(logs), len(OFFSETS_S), 3))
     for piece in pieces:
-        by_log[piece.log] += [_moments(piece, offset) for offset in OFFSETS_S.tolist()]
+        seen, imu = piece.camera.t_s[piece.fine], piece.imu
+        by_log[piece.log] += moments(
+            seen, piece.phi[piece.fine], imu.t_s, piece.theta, OFFSETS_S, _LEAST_PICTURES
+        )
     for log, own in zip(logs, by_log, strict=True):
         _check_gyro(log, own)
     sums = by_log.sum(axis=0)
-    factors, left = _factors(sums)
+    factors, left = shares(sums, scaled=False)
     usual = int(np.argmin(np.abs(OFFSETS_S - usual_offset_s)))
     best = int(np.argmin(left))
     moves = bool((left.max() - left[best]) * sums[best, 2] / _PHI_SIGMA**2 > _WORTH)

@@ -22,7 +22,7 @@ from calib.core.verdict import Finding
 from calib.io.columns import ACCEL, GYRO
 from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
 from calib.solve.clock import Part
-from calib.stages.actuator.kinematics import MARKER_OFFSET_M
+from calib.solve.delay import delay_of
 from calib.stages.imu.sampling import (
     AXES,
     MOST_GYRO_RADPS,
@@ -84,83 +84,6 @@ def _of(log: Log, signals: Signals, *findings: Finding) -> Readings:
     )  # fmt: skip
 
 
-# ----------------------------------------------------------------------
-# The bending angle that the rig's camera sees, as a reference for angles of the IMU.
-#
-# Of an arc of constant curvature the chord to the head has half of the head's angle (3.10), and the marker
-# (mx, my) lies d further along the head's tangent (A.1). Both together give
-#
-#     tan(phi / 2) = mx / (my + d)
-#
-# whatever the length. Pictures come late; by how much follows from the log: the lag is the one at which
-# the camera's angle differs least from another angle of the same log.
-
-_LAGS_S, _LONG_LAGS_S = np.arange(-0.02, 0.1201, 0.001), np.arange(-0.02, 0.8001, 0.005)
-_FEWEST = 30
-_LEAST_MOTION_RAD2 = 1e-6
-_CLEAR = 0.25
-"""Share of a camera's angle that a long lag leaves, at most."""
-
-
-def angle_from_marker(marker_m: FloatArray, offset_m: float = MARKER_OFFSET_M) -> FloatArray:
-    """Bending angle phi (n,) [rad] of markers (n, 2) in the plane [m], `offset_m` beyond the head."""
-    x, y = marker_m.T
-    return np.asarray(2.0 * np.arctan2(x, y + offset_m))
-
-
-def _about(at: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:
-    """The lag [s], to 5 ms, at which the gyroscope's angle leaves the least share, but for a line in time.
-
-    0 where that is a usual one, or explains the angle hardly better.
-    """
-    left = []
-    for lag in _LONG_LAGS_S.tolist():
-        inside = (at - lag > t_s[0]) & (at - lag < t_s[-1])
-        left.append(1.0)
-        # A lag that puts most of the motion outside the IMU's time explains none of it.
-        if int(inside.sum()) < _FEWEST or late_rad[inside].var() <= 0.5 * late_rad.var():
-            continue
-        t, seen = at[inside], late_rad[inside]
-        line = np.stack([np.ones(len(t)), t - t.mean()], axis=1)
-        norms = (line * line).sum(axis=0)
-        turned, seen = (
-            one - line @ (line.T @ one / norms) for one in (np.interp(t - lag, t_s, turned_rad), seen)
-        )
-        # Of a swing a period early the rest has the same shape and is larger.
-        left[-1] = float(((seen - turned) ** 2).sum() / max((seen**2).sum(), _LEAST_MOTION_RAD2))
-    k, usual = int(np.argmin(left)), min(left[: int(np.searchsorted(_LONG_LAGS_S, _LAGS_S[-1]))])
-    return float(_LONG_LAGS_S[k]) if left[k] < min(_CLEAR, 0.5 * usual) else 0.0
-
-
-def lag_of(
-    late_t_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray, turned_rad: FloatArray
-) -> float:
-    """By how much [s] one angle (m,) is later than another (n,), from -20 to 800 ms; 0 for standing still.
-
-    The lag of least variance of the difference; between the two neighbours it is that of the parabola.
-
-    Parameters
-    ----------
-    turned_rad : (n,) what the gyroscope has turned, which says where to look.
-    """
-    seen = np.isfinite(late_rad)
-    at, late = late_t_s[seen], late_rad[seen]
-    middle = _about(at, late, t_s, turned_rad)
-    lags = middle + _LAGS_S[:41] if middle else _LAGS_S
-    known = (at > t_s[0] + float(lags[-1]) + 0.01) & (at < t_s[-1] - 0.03)
-    if int(known.sum()) < _FEWEST:
-        return middle
-    at, late = at[known], late[known]
-    variance = np.array([float((late - np.interp(at - lag, t_s, phi_rad)).var()) for lag in lags.tolist()])
-    k = int(np.argmin(variance))
-    # A minimum at the end, or one that stands out by nothing, tells no lag.
-    if k in (0, len(lags) - 1) or float(variance.max()) < 1.02 * float(variance[k]):
-        return middle
-    a, b, c = variance[k - 1 : k + 2].tolist()
-    bend = a - 2.0 * b + c
-    return float(lags[k] + (0.5 * 0.001 * (a - c) / bend if bend > 0.0 else 0.0))
-
-
 def drift_log(log: Log) -> Readings:
     """The IMU's readings and the angles of a log in which it may move.
 
@@ -195,12 +118,12 @@ class Reading:
     ----------
     tilted : take the rate from the up vector (`calib.stages.imu.tracks`) and not -gz.
     reference : auto, truth, camera, onchip or none; auto takes the camera where the log has it.
-    on_plane : from pixels (n, 2) to metres (n, 2) in the rig's plane, None where it has none.
+    angle_seen : from pixels (n, 2) to the bending angle (n,), None where the rig has no plane.
     """
 
     tilted: bool
     reference: str
-    on_plane: Callable[[FloatArray], FloatArray] | None = None
+    angle_seen: Callable[[FloatArray], FloatArray] | None = None
 
 
 def sensor_noise(rig: Rig, logs: Sequence[TuneLog]) -> tuple[Noise, str]:
@@ -234,7 +157,7 @@ def _reference(log: Log, read: Readings, how: Reading) -> tuple[str, FloatArray,
     seen = len(rows) >= _TUNELOGS_FEWEST
     if name == "auto":
         # A truth is for scores: gains that were chosen by it say nothing of a rig that has none.
-        name = "camera" if seen and how.on_plane is not None else "none"
+        name = "camera" if seen and how.angle_seen is not None else "none"
     if name == "none":
         return "", none, none
     camera = "a camera, but the rig's file has no plane" if seen else "no columns u_px and v_px"
@@ -243,9 +166,9 @@ def _reference(log: Log, read: Readings, how: Reading) -> tuple[str, FloatArray,
         "onchip": (read.onchip_t_s, read.onchip_phi_rad, "no column onchip_phi_rad"),
         "camera": (none, none, camera),
     }[name]
-    if name == "camera" and seen and how.on_plane is not None:
+    if name == "camera" and seen and how.angle_seen is not None:
         pixels = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
-        phi = angle_from_marker(how.on_plane(pixels))
+        phi = how.angle_seen(pixels)
         known = np.isfinite(phi)
         if int(known.sum()) < _TUNELOGS_FEWEST:
             raise BadInputError(
@@ -282,7 +205,7 @@ def _lag(
     turned = own = integral(t, rate)
     if len(rate) * period_s >= SHORTEST_S + period_s:
         own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk).phi_rad
-    return lag_of(late_t_s, np.unwrap(late_rad), t, own, turned)
+    return delay_of(late_t_s, np.unwrap(late_rad), t, own, turned)
 
 
 def tune_log(log: Log, how: Reading) -> TuneLog:

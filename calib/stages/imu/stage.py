@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -167,7 +166,9 @@ class TuneOptions(LogOptions):
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
+    from calib.core.rig import Geometry
     from calib.io.logs import read_log
+    from calib.stages.actuator.kinematics import angle_from_marker
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
     from calib.stages.imu.sampling import check_rate
     from calib.stages.imu.tuning import TuneInputs
@@ -177,7 +178,10 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     if options.reference in ("auto", "camera"):
         plane = rig.current_plane(files.rig_path)
     if camera is not None and plane is not None:
-        how = replace(how, on_plane=partial(plane.to_world, camera=camera))
+        offset_m = (rig.geometry or Geometry()).marker_offset_m
+        how = replace(
+            how, angle_seen=lambda pixels: angle_from_marker(plane.to_world(pixels, camera), offset_m)
+        )
     logs: list[TuneLog] = []
     for path in files.paths:
         log = tune_log(read_log(path, options, files.remarks, rig.picture_px), how)
@@ -188,7 +192,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
         check_rate(log.sampling, shown(path), logs[0].sampling, logs[0].source)
     files.hashes |= rig.identities("imu")
     if any(log.reference == "camera" for log in logs):
-        files.hashes |= rig.identities("camera", "plane")
+        files.hashes |= rig.identities("geometry", "camera", "plane")
     return TuneInputs(logs, *sensor_noise(rig, logs), how.tilted)
 
 

@@ -1,0 +1,195 @@
+"""By how much one record of a motion is later than another, from the motion that both show.
+
+What is late, y, and what is not, x, are held against each other at delays d by the sums of x y, x^2 and y^2
+about straight lines or means,
+
+    left(d) = min over a of sum (y(t) - a x(t - d))^2 / sum y(t)^2,
+
+with a = 1 where both have one scale. A delay that puts most of the motion outside the time of x, as a twitch
+at the start, explains none of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import correlate
+
+from calib.core.arrays import BoolArray, FloatArray, integral
+
+
+def moments(
+    late_s: FloatArray,
+    late: FloatArray,
+    t_s: FloatArray,
+    other: FloatArray,
+    delays_s: FloatArray,
+    fewest: int,
+) -> FloatArray:
+    """Sums (k, 3) of x y, x^2 and y^2 about straight lines, at each delay; 0 where fewer samples are shared.
+
+    Parameters
+    ----------
+    late_s, late : times and values y (m,). t_s, other : of x (n,). delays_s : (k,).
+    """
+    sums = np.zeros((len(delays_s), 3))
+    for row, delay in zip(sums, delays_s.tolist(), strict=True):
+        inside = (late_s - delay >= t_s[0]) & (late_s - delay <= t_s[-1])
+        if int(inside.sum()) < fewest:
+            continue
+        t, y = late_s[inside], late[inside]
+        x = np.interp(t - delay, t_s, other)
+        line = np.stack([np.ones(len(t)), t - t.mean()], axis=1)
+        norms = (line * line).sum(axis=0)
+        x = x - line @ (line.T @ x / norms)
+        y = y - line @ (line.T @ y / norms)
+        row[:] = x @ y, x @ x, y @ y
+    return sums
+
+
+def shares(sums: FloatArray, scaled: bool) -> tuple[FloatArray, FloatArray]:
+    """Factors a (k,) and the shares of the late one's squares that are left (k,), of sums (k, 3).
+
+    Parameters
+    ----------
+    scaled : whether both have one scale; else a is the best one.
+    """
+    cross, own, total = sums.T
+    a = np.ones(len(sums)) if scaled else np.divide(cross, own, out=np.zeros(len(sums)), where=own > 0.0)
+    seen = total > max(0.5 * float(total.max(initial=0.0)), 0.0)
+    explained = np.divide(a * (2.0 * cross - a * own), total, out=np.zeros(len(sums)), where=seen)
+    return a, np.maximum(1.0 - explained, 0.0)
+
+
+def vertex(before: float, least: float, after: float) -> float:
+    """Where, in steps from the middle one, the parabola through three values is least; 0 for a line."""
+    bend = before - 2.0 * least + after
+    return 0.5 * (before - after) / bend if bend > 0.0 else 0.0
+
+
+# ----------------------------------------------------------------------
+# Of an angle, after that of an IMU.
+
+_USUAL_S, _LONG_S = np.arange(-0.02, 0.1201, 0.001), np.arange(-0.02, 0.8001, 0.005)
+_FEWEST = 30
+_CLEAR = 0.25
+"""Share of an angle that a long delay leaves, at most."""
+
+
+def _about(late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:
+    """The delay [s], to 5 ms, that leaves the least; 0 where that is a usual one, or leaves hardly less."""
+    # Of a swing a period early the rest has the same shape and is larger.
+    left = shares(moments(late_s, late_rad, t_s, turned_rad, _LONG_S, _FEWEST), True)[1]
+    k, usual = int(np.argmin(left)), float(left[: int(np.searchsorted(_LONG_S, _USUAL_S[-1]))].min())
+    return float(_LONG_S[k]) if left[k] < min(_CLEAR, 0.5 * usual) else 0.0
+
+
+def delay_of(
+    late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray, turned_rad: FloatArray
+) -> float:
+    """By how much [s] one angle (m,) is later than another (n,), from -20 to 800 ms; 0 for standing still.
+
+    The delay of least variance of the difference; between the two neighbours it is that of the parabola.
+
+    Parameters
+    ----------
+    turned_rad : (n,) what the gyroscope has turned, which says where to look.
+    """
+    seen = np.isfinite(late_rad)
+    at, late = late_s[seen], late_rad[seen]
+    middle = _about(at, late, t_s, turned_rad)
+    delays = middle + _USUAL_S[:41] if middle else _USUAL_S
+    known = (at > t_s[0] + float(delays[-1]) + 0.01) & (at < t_s[-1] - 0.03)
+    if int(known.sum()) < _FEWEST:
+        return middle
+    at, late = at[known], late[known]
+    variance = np.array([float((late - np.interp(at - d, t_s, phi_rad)).var()) for d in delays.tolist()])
+    k = int(np.argmin(variance))
+    # A minimum at the end, or one that stands out by nothing, tells no delay.
+    if k in (0, len(delays) - 1) or float(variance.max()) < 1.02 * float(variance[k]):
+        return middle
+    return float(delays[k] + 0.001 * vertex(*variance[k - 1 : k + 2].tolist()))
+
+
+# ----------------------------------------------------------------------
+# Of two recordings, each with its clock. Both are differenced over `_OVER` steps of a grid, and all delays at
+# which more than half of motion and time is shared are tried. A swing repeats after each period but for its
+# size, so that the next best delay has to leave twice as much.
+
+_STEP_S, _OVER = 0.01, 10
+_GAP_S = 0.15
+_MOST_LEFT, _APART = 0.4, 0.5
+"""Share of the motion that may be left, and of what the next best delay leaves."""
+_BESIDE_S = 0.1
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """How two clocks stand to each other.
+
+    Attributes
+    ----------
+    offset_s : to be added to the pictures' times. drift_s : by how much more in the second half than in the
+        first; None where one of them does not tell.
+    left, next_left : shares of the motion that are left at this offset, and at the next best one.
+    """
+
+    offset_s: float
+    drift_s: float | None
+    left: float
+    next_left: float
+
+
+def _on_grid(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Times of a grid, rates there, and whether they are between samples that are close together."""
+    at = np.arange(t_s[0], t_s[-1], _STEP_S)
+    after = np.clip(np.searchsorted(t_s, at, side="right"), 1, len(t_s) - 1)
+    near = t_s[after] - t_s[after - 1] < _GAP_S
+    smooth = np.interp(at, t_s, values)
+    rate = (smooth[_OVER:] - smooth[:-_OVER]) / (_OVER * _STEP_S)
+    middle = _OVER // 2
+    return at[middle : middle + len(rate)], rate, near[_OVER:] & near[:-_OVER]
+
+
+def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, scaled: bool) -> FloatArray:
+    """left (n,) at the delays 1 - len(seen) .. len(felt) - 1 of grids."""
+    seen = np.where(known, seen - seen[known].mean(), 0.0)
+    there, rows = np.ones(len(felt)), known.astype(np.float64)
+    sums = np.stack([correlate(felt, seen), correlate(felt**2, rows), correlate(there, seen**2)], axis=1)
+    sums[correlate(there, rows) <= 0.5 * float(rows.sum())] = 0.0
+    return shares(sums, scaled)[1]
+
+
+def clocks(
+    camera_s: FloatArray, way: FloatArray, imu_s: FloatArray, gz_radps: FloatArray, scaled: bool
+) -> Clocks | None:
+    """How two clocks stand to each other by a motion that both saw; None where it does not tell.
+
+    Parameters
+    ----------
+    camera_s, way : (n,) times and angle phi [rad], or with `scaled` False any measure of the motion.
+    imu_s, gz_radps : (m,) times and rates.
+    """
+    at, seen, known = _on_grid(camera_s, way)
+    felt_s, felt, _ = _on_grid(imu_s, -integral(imu_s, gz_radps - np.median(gz_radps)))
+    if known.sum() < 10 * _OVER or len(felt) < 10 * _OVER:
+        return None
+
+    def offset(known: BoolArray) -> tuple[float, float, float]:
+        left = _left(seen, known, felt, scaled)
+        k = int(np.argmin(left))
+        beside = round(_BESIDE_S / _STEP_S)
+        others = np.concatenate([left[: max(k - beside, 0)], left[k + beside + 1 :], [1.0]])
+        part = vertex(*left[k - 1 : k + 2].tolist()) if 0 < k < len(left) - 1 else 0.0
+        lag_s = (k + part - (len(seen) - 1)) * _STEP_S
+        return lag_s + float(felt_s[0] - at[0]), float(left[k]), float(others.min())
+
+    whole, left, following = offset(known)
+    if left > min(_MOST_LEFT, _APART * following):
+        return None
+    first = np.arange(len(at)) < len(at) // 2
+    parts = (known & first, known & ~first)
+    halves = [offset(part) for part in parts if part.sum() >= 10 * _OVER]
+    clear = len(halves) == 2 and all(one[1] <= min(_MOST_LEFT, _APART * one[2]) for one in halves)
+    return Clocks(whole, halves[1][0] - halves[0][0] if clear else None, left, following)
