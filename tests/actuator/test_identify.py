@@ -438,7 +438,12 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "seed"), [(RateLimit(0.35), 1), (Orifice(0.9, 1.3), 1), (Orifice(0.9, 1.3), 3)]
+    ("law", "seed"),
+    [
+        (RateLimit(0.35), 1),
+        (Orifice(0.9, 1.3), 1),
+        pytest.param(Orifice(0.9, 1.3), 3, marks=pytest.mark.slow),
+    ],
 )
 def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, seed: int, tmp_path: Path) -> None:
     """Seed 3 from the limited rate alone: springs of .26, turbulence of 4.2 +- .5."""
@@ -457,7 +462,9 @@ def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, seed: int, tmp_
     assert {*asdict(law)} & {*found.values}
 
 
-@pytest.mark.parametrize("play", [{}, {"play_pwm": 18.0}, {"play_N": 0.14}])
+@pytest.mark.parametrize(
+    "play", [{}, {"play_pwm": 18.0}, pytest.param({"play_N": 0.14}, marks=pytest.mark.slow)]
+)
 def test_a_play_is_found_where_there_is_one(play: dict[str, float], tmp_path: Path) -> None:
     rig_yaml = tmp_path / "rig.yaml"
     known = rig_file(rig_yaml)

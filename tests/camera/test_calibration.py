@@ -755,6 +755,7 @@ def test_a_lens_of_150_degrees_is_recovered_from_exact_views(skew_px: float) -> 
     np.testing.assert_allclose(fit.camera.distortion, truth.distortion, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_sigma_covers_a_lens_of_150_degrees() -> None:
     truth = camera_of((748, 480), 150.0, (0.03, -0.01, 0.0, 0.0, 0.004, -0.001), FISHEYE)
     exact = _of_150_degrees(5, 0.0)

@@ -29,7 +29,7 @@ def _pictures(drawing: Drawing, count: int, blur_px: float) -> tuple[list[np.nda
     return pictures, [inner_corners(drawing, *p) for p in poses]
 
 
-_OTHERS = ("before OpenCV 4.6", "thin margins")
+_OTHERS = ("before OpenCV 4.6", "thin margins", "AprilTags")
 
 
 @pytest.mark.parametrize(
@@ -74,6 +74,7 @@ def test_nothing_has_markers_that_has_none(project_root: Path) -> None:
     assert recognise([*views, np.full((200, 300), 90, dtype=np.uint8), blocks]) is None
 
 
+@pytest.mark.slow
 def test_public_pictures_are_fitted_better_than_by_opencv(shared_data: Path) -> None:
     """17 photographs of a screen; OpenCV's detector with its best marker length, its calibration 5 + 4."""
     from calib.stages.camera.intrinsics import calibrate_camera
@@ -128,9 +129,10 @@ def _april_grid() -> Drawing:
             _circles(9, 6, "symmetric"),
             "the pictures show a symmetric grid of circles, 9x6; calib reads check",
         ),
-        (
+        pytest.param(
             _april_grid(),
             "the pictures show a grid of APRILTAG_36H11 markers, 6x6; calib reads checkerboards and Ch",
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -78,7 +78,7 @@ def test_steps_of_the_pumps_are_recorded_with_the_boards_own_times(bare: Built, 
     assert simulated.duty == (0, 0)
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_no_sample_of_the_imu_comes_twice(bare: Built, tmp_path: Path, seed: int) -> None:
     """Whatever the sensor's clock is: it starts with 100 new rates a second, as many as are read."""
     simulated = SimulatedBoard(bare, seed=seed)

@@ -206,6 +206,7 @@ def test_rig_yaml_is_what_intrinsics_writes(tmp_path: Path, project_root: Path) 
         source_of(str(rig / "images"), rig / "images")
 
 
+@pytest.mark.slow
 def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
     person = Person(np.random.default_rng(0))
     video = cv2.VideoWriter(
