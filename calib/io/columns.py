@@ -86,7 +86,7 @@ UNITS: dict[str, dict[str, float]] = {
     "pixel": {"px": 1.0},
     "pwm": {"pwm": 1.0, "percent": 2.55},
     "pressure": {"kPa": 1.0, "Pa": 1e-3, "bar": 100.0, "psi": 6.894757},
-    "length": {"m": 1.0, "mm": 1e-3},
+    "length": {"m": 1.0, "mm": 1e-3, "cm": 0.01},
 }
 """Units of each kind of column in that of the column's own name, which is the first. Counts stay counts."""
 
@@ -98,7 +98,7 @@ _SPELLED = {
     "rad/s": "rad/s rads radps rad_s rad/sec", "deg/s": "deg/s °/s dps degps degs deg_s deg/sec",
     "mdeg/s": "mdps mdeg/s", "rad": "rad", "deg": "deg degree degrees °", "px": "px pixel pixels pix",
     "counts": "raw lsb count counts adc", "percent": "% percent",
-    "kPa": "kpa", "Pa": "pa pascal", "bar": "bar", "psi": "psi",
+    "kPa": "kpa", "Pa": "pa pascal", "bar": "bar", "psi": "psi", "m": "m", "mm": "mm", "cm": "cm",
 }  # fmt: skip
 _UNIT = {word: unit for unit, words in _SPELLED.items() for word in words.split()}
 
@@ -112,6 +112,7 @@ _PIXEL = re.compile(r"(?:pixel|px|marker|cam|camera|image|img|blob|pixy)?(?P<axi
 _PIXEL_XY = re.compile(r"(?:pixel|px|marker|blob|pixy)(?P<axis>[xy])")
 _PWM = re.compile(r"(?:pwm|duty|valve|cmd|command|pump)(?P<number>[12])")
 _PRESSURE = re.compile(rf"p(?P<commanded>cmd)?(?P<number>[1-{CHAMBERS}])")
+_POSE = re.compile(r"(?P<of>base|tip)(?P<axis>[xyz])|tip(?P<phi>phi|angle)")
 _CHIP = re.compile(r"(?:onchip|chip|fused|fusion)(?:phi|angle)")
 _DEVICES = ("imu", "bno055", "bno", "mpu6050", "mpu", "sensor", "field", "data", "msg")
 
@@ -205,6 +206,8 @@ def _column(word: str, unit: str) -> tuple[str, str] | None:
         column = f"pwm{pwm['number']}"
     elif unit and (pressure := _PRESSURE.fullmatch(word)):
         column = f"p{'_cmd' if pressure['commanded'] else ''}{pressure['number']}_kpa"
+    elif unit and (pose := _POSE.fullmatch(word)):
+        column = "tip_phi_rad" if pose["phi"] else f"{pose['of']}_{pose['axis']}_m"
     elif _CHIP.fullmatch(word):
         column = "onchip_phi_rad"
     if not column or (unit and unit not in UNITS[kind_of(column)]):
@@ -416,9 +419,10 @@ class ColumnMap:
         for column, source in self.sources.items():
             kind = kind_of(column)
             own = next(iter(UNITS.get(kind, {"": 1.0})))
+            what = column if column in POSE else words.get(kind, column)
             if source.column != column or source.unit != own or source.factor != 1.0 or source.offset:
                 in_unit = f" in {source.unit}" if kind in words else ""
-                groups.setdefault((kind, f"{words.get(kind, column)}{in_unit}"), []).append(source.column)
+                groups.setdefault((kind, f"{what}{in_unit}"), []).append(source.column)
         parts = [self.above] if self.above else []
         for (kind, what), columns in groups.items():
             why = f" ({self.evidence[kind]})" if kind in self.evidence else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,19 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.columns import known_name
 from calib.io.logs import Log, read_log
-from calib.stages.arm.identify import FULL, best_baseline, errors_by, fit, gained, half_width, identify
-from calib.stages.arm.model import PARAMETERS, Assembly, Trial, segment_run, values_on
-from calib.stages.arm.read import frame_findings, frame_of, recording_of, trial_of
+from calib.stages.arm.identify import (
+    FULL,
+    best_baseline,
+    by_pressure,
+    errors_by,
+    fit,
+    gained,
+    half_width,
+    identify,
+    mean_of,
+)
+from calib.stages.arm.model import PARAMETERS, Assembly, Trial, begun, segment_run, values_on
+from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +71,7 @@ def test_a_part_that_is_off_plays_no_part() -> None:
     p = np.full(len(one.t_s), 100.0)
     angle, _ = segment_run(one, off, p)
     rest = off["rest_rad"] + 100.0 * off["bends_rad_per_kpa"] / (1.0 + 100.0 * off["stiffens_per_kpa"])
-    expected = rest + (one.angle_rad[0] - rest) * np.exp(-one.t_s / off["lag_s"])
+    expected = rest + (begun(one.angle_rad) - rest) * np.exp(-one.t_s / off["lag_s"])
     np.testing.assert_allclose(angle, expected, atol=1e-9)
 
 
@@ -147,12 +158,106 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
     assert any("line 702: motion capture jumps by 2." in text for text in texts)
 
 
+def _said(columns: dict[str, FloatArray], trial: Trial) -> str:
+    return "; ".join(
+        f"{one.severity}: {one.text}" for one in recording_of(_log(columns, trial), "a").findings
+    )
+
+
+@pytest.mark.parametrize(
+    ("column", "least_s", "words"),
+    [
+        (
+            "p1_kpa",
+            5.0,
+            "poor: a: its pressure stands still from 10.0 to 15.0 s while its command moves: frozen",
+        ),
+        (
+            "p_cmd1_kpa",
+            15.0,
+            "poor: a: its command stands still from 10.0 to 25.2 s while its pressure moves",
+        ),
+        ("tip", 5.0, "poor: a: its pose stands still from 10.0 to 15.0 s while its command moves: frozen"),
+    ],
+)
+def test_a_signal_that_freezes_while_others_move_is_told(column: str, least_s: float, words: str) -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial)
+    assert "frozen" not in _said(columns | {"p2_kpa": trial.t_s, "p3_kpa": trial.t_s}, trial)
+    rows = slice(500, 501 + round(50 * least_s))
+    for name in columns:
+        if name.startswith(column):
+            columns[name] = columns[name].copy()
+            columns[name][rows] = columns[name][500]
+    assert words in _said(columns, trial)
+
+
+def test_a_command_that_nobody_knows_and_a_place_that_jumps_are_told() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial)
+    columns["p_cmd1_kpa"] = np.where(np.abs(trial.t_s - 20.0) < 2.0, np.nan, trial.command)
+    columns["tip_y_m"] = columns["tip_y_m"] + 0.02 * (trial.t_s > 30.0)
+    said = _said(columns, trial)
+    assert "poor: a: has no command from 18.0 to 22.0 s, which a free run needs" in said
+    assert "line 1503: motion capture jumps by 20" in said
+
+
+def test_poses_that_were_not_seen_do_not_count() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial, planar=True)
+    gone = np.abs(trial.t_s - 20.0) < 5.0
+    columns["tip_phi_rad"] = np.where(gone, np.nan, columns["tip_phi_rad"])
+    recording = recording_of(_log(columns, trial), "a")
+    again = trial_of(recording, frame_of([recording]), "a", 0.0)
+    assert again.unseen is not None
+    assert again.unseen.sum() == pytest.approx(gone.sum(), abs=2)
+    off = by_pressure(again, TRUE)["angle_rad"]
+    assert len(off) == len(again.t_s) - again.unseen.sum()
+    assert np.sqrt(np.mean(off**2)) < 5e-3
+
+
+def test_an_arm_that_bends_to_negative_angles_is_the_same_arm() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial, planar=True)
+    columns |= {"tip_phi_rad": -columns["tip_phi_rad"], "tip_x_m": 0.1 - columns["tip_x_m"]}
+    columns |= {"base_x_m": np.full(len(trial.t_s), 0.1), "base_y_m": np.zeros(len(trial.t_s))}
+    recording = recording_of(_log(columns, trial), "a")
+    frame = frame_of([recording])
+    assert [one.text for one in frame_findings(frame)] == [
+        "tip_phi_rad falls as the arm bends; the angle is counted as it grows with bending"
+    ]
+    again = trial_of(recording, frame, "a", 0.0)
+    np.testing.assert_allclose(again.angle_rad, trial.angle_rad[: len(again.angle_rad)], atol=2e-3)
+    np.testing.assert_allclose(again.chord_m, trial.chord_m[: len(again.chord_m)], atol=2e-4)
+    right = recording_of(_log(columns_of(trial, planar=True), trial), "a")
+    with pytest.raises(BadInputError, match="turns about an axis 180 deg from that of the arm"):
+        check_frame([right], frame)
+    check_frame([recording], frame)
+
+
+def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:
+    """Without creep, stops and stiffening: the usual errors would hold parameters at their priors."""
+    plain = FULL.without("creep", "hysteresis", "settling", "load", "stiffening")
+    true = plain.values(np.zeros(len(PARAMETERS)), SCALE) | {"lag_s": 1.0, "bends_rad_per_kpa": 0.004}
+    trials = [replace(simulated(f"a_{k}", k, values=true), command=np.zeros(0)) for k in range(3)]
+    found = identify(trials, compare=False)
+    assert math.degrees(mean_of(found.held, "angle_by_pressure_rad")) < 0.3
+    assert found.fit.scale.finer == 10.0
+    assert found.fit.values["bends_rad_per_kpa"] == pytest.approx(0.004, rel=0.03)
+    assert found.fit.values["lag_s"] == pytest.approx(1.0, rel=0.05)
+    assert found.fit.values["stiffens_per_kpa"] < 2e-4
+
+
 def test_units_that_no_arm_has_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)
     lengths = {name: 1e3 * columns[name] for name in columns if name.endswith("_m")}
     with pytest.raises(BadInputError, match="m apart, expected at most 3; columns"):
         recording_of(_log(columns | lengths, trial), "a")
+    degrees = columns_of(trial, planar=True)
+    degrees["tip_phi_rad"] = np.degrees(degrees["tip_phi_rad"])
+    with pytest.raises(BadInputError, match=r"tip_phi_rad reaches .* rad, expected at most 6\.28; columns"):
+        recording_of(_log(degrees, trial), "a")
     for factor, words in ((1e3, "columns.yaml takes Pa"), (0.01, "kPa at most, as bar would")):
         pressures = {name: factor * columns[name] for name in columns if name.endswith("_kpa")}
         try:
@@ -187,6 +292,9 @@ def test_pressures_are_read_by_their_unit(tmp_path: Path) -> None:
     assert known_name("p1_psi") == ("p1_kpa", "psi")
     assert known_name("P_cmd2 (bar)") == ("p_cmd2_kpa", "bar")
     assert known_name("p1") is None
+    assert known_name("base_x_mm") == ("base_x_m", "mm")
+    assert known_name("tip phi [deg]") == ("tip_phi_rad", "deg")
+    assert known_name("tip_x") is None
     rows = "\n".join(f"{0.01 * k:.2f},{k % 7}" for k in range(40))
     (tmp_path / "a.csv").write_text(f"t_s,p1_psi\n{rows}\n", encoding="utf-8")
     assert read_log(tmp_path / "a.csv").columns["p1_kpa"][1] == pytest.approx(6.894757)

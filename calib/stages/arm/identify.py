@@ -1,8 +1,9 @@
 """Fit an assembly to trials, and predict each trial from a fit to the others.
 
-Least squares over whole free runs with the parameters' priors, in two steps: the segment from the measured
-pressure, then the drive from the command with the segment as it is, so that what a valve's model misses does
-not bend the arm's. Without a measured pressure all is fitted from the command at once. Errors of a free run
+Least squares over whole free runs with the parameters' priors, in steps: the segment from the measured
+pressure, with little weight on the chord, then the chord alone, then the drive from the command with the
+segment as it is, so that what the models of chord and valve miss does not bend the arm's. Without a measured
+pressure all is fitted from the command at once. Errors of a free run
 stay alike for seconds, so a sample counts as 1/`_ALIKE` of a reading. Days differ by factors with priors of
 their own. Standard deviations are the larger of the posterior's and of the jackknife's over trials, as trials
 differ by more than their samples tell.
@@ -17,7 +18,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -26,10 +28,12 @@ from scipy.special import stdtrit
 
 from calib.core.arrays import FloatArray, IntArray, blocks
 from calib.stages.arm.model import (
+    CHORD,
     DAILY,
     DRIVES,
     PARAMETERS,
     PARTS,
+    SEGMENT,
     STEP_S,
     Assembly,
     Days,
@@ -46,6 +50,8 @@ WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
 _SIGMA = {"pressure_kpa": 0.03, "angle_rad": 0.027, "chord_m": 0.0045}
 """Of their scale: what assemblies of this kind leave."""
+_LOOSE = 1.5
+"""Times the chord's, while it helps to tell the segment."""
 _ALIKE, _EVERY = 300, 5
 """Samples of one error, and of which one is looked at. Errors on held trials of a real arm have an integral
 time of 2 to 7 s about their mean over the trial, and of 4 to 37 s with it."""
@@ -134,16 +140,17 @@ def _bent(trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray) -
     if not (len(trial.angle_rad) and len(pressure_kpa)):
         return {}
     angle, chord = segment_run(trial, values, pressure_kpa)
-    return {"angle_rad": angle - trial.angle_rad, "chord_m": chord - trial.chord_m}
+    seen = slice(None) if trial.unseen is None else ~trial.unseen
+    return {"angle_rad": (angle - trial.angle_rad)[seen], "chord_m": (chord - trial.chord_m)[seen]}
 
 
 def by_pressure(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
-    """Simulated less measured values (n,) of the segment under the measured pressure."""
+    """Simulated less measured values of the segment under the measured pressure, where poses were seen."""
     return _bent(trial, values, trial.pressure_kpa)
 
 
 def by_command(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
-    """Simulated less measured values (n,) of drive and segment under the command."""
+    """Simulated less measured values of drive and segment under the command."""
     if not len(trial.command):
         return {}
     run = drive_run(trial, values)
@@ -161,15 +168,14 @@ class _Problem:
         self.trials, self.assembly, self.scale = trials, assembly, scale
         days = sorted({one.day for one in trials})
         self.daily = [(day, name) for day in days for name in DAILY if name in assembly.names]
-        alike = math.sqrt(_ALIKE / _EVERY)
+        alike = math.sqrt(_ALIKE / _EVERY) / scale.finer
         self.sizes = {name: share * getattr(scale, name) * alike for name, share in _SIGMA.items()}
 
-    def indices(self, drives: bool) -> IntArray:
-        """Parameters of the drive, or of the segment, and factors of these, where the assembly has them."""
-        mine = set(self.assembly.names)
-        of = [name for names in DRIVES.values() for name in names]
-        names = [p.name for p in PARAMETERS] + [name for _, name in self.daily]
-        return np.array([k for k, name in enumerate(names) if name in mine and (name in of) == drives])
+    def indices(self, *names: str) -> IntArray:
+        """These parameters and their factors, where the assembly has them."""
+        mine = set(self.assembly.names) & set(names)
+        every = [p.name for p in PARAMETERS] + [name for _, name in self.daily]
+        return np.array([k for k, name in enumerate(every) if name in mine])
 
     def days(self, z: FloatArray) -> dict[str, dict[str, float]]:
         out: dict[str, dict[str, float]] = {one.day: {} for one in self.trials}
@@ -196,6 +202,12 @@ class _Problem:
         ]
         return np.stack(sides, axis=1) / (2.0 * _STEP)
 
+    def loosely(self, of: str, times: float) -> _Problem:
+        """The same with larger errors of one kind."""
+        other = copy(self)
+        other.sizes = self.sizes | {of: times * self.sizes[of]}
+        return other
+
     def solve(self, model: _Model, z: FloatArray, free: IntArray) -> tuple[FloatArray, FloatArray]:
         """z with its free entries where errors and deviations are least, and their covariance."""
         rows, slopes = partial(self.rows, model, z, free), partial(self.slopes, model, z, free)
@@ -214,15 +226,29 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
         z[count:] = [
             math.log(start.days.get(day, {}).get(name, 1.0)) / DAILY[name] for day, name in problem.daily
         ]
-    segment, drive = problem.indices(False), problem.indices(True)
+    drive = problem.indices(*(name for names in DRIVES.values() for name in names))
+    segment, chord = problem.indices(*SEGMENT), problem.indices(*CHORD)
     covariance = np.eye(len(z))
+    loose = problem.loosely("chord_m", _LOOSE)
     together = not any(len(one.pressure_kpa) and len(one.angle_rad) for one in trials)
-    if not together:
-        z, covariance[np.ix_(segment, segment)] = problem.solve(by_pressure, z, segment)
-    if any(len(one.command) for one in trials):
-        free = np.concatenate([drive, segment]) if together else drive
-        z, covariance[np.ix_(free, free)] = problem.solve(by_command, z, free)
-    return Fit(assembly, scale, z[:count], covariance[:count, :count], problem.days(z))
+    steps = [(loose, by_pressure, segment), (problem, by_pressure, chord), (loose, by_command, drive)]
+    if together:
+        steps = [(loose, by_command, np.concatenate([drive, segment])), (problem, by_command, chord)]
+    for weighed, model, free in steps:
+        if model is by_pressure or any(len(trial.command) for trial in trials):
+            z, own = weighed.solve(model, z, free)
+            covariance[free], covariance[:, free] = 0.0, 0.0
+            covariance[np.ix_(free, free)] = own
+    found, days = z[:count].copy(), problem.days(z)
+    for k, one in enumerate(PARAMETERS):
+        if one.name in DAILY and one.name in assembly.names:
+            # What all days share is the parameter's.
+            logs = [math.log(day[one.name]) for day in days.values()]
+            shared = math.exp(sum(logs) / len(logs))
+            found[k] = one.times(found[k], shared, scale)
+            for day in days.values():
+                day[one.name] /= shared
+    return Fit(assembly, scale, found, covariance[:count, :count], days)
 
 
 _NONE = np.zeros(0)
@@ -376,6 +402,33 @@ def half_width(errors: Sequence[float]) -> float:
     return float(stdtrit(max(freedom, 1.0), 0.975)) * math.sqrt(mean)
 
 
+_FINER = (3.0, 10.0)
+_WORTHWHILE = 0.8
+"""Held error with smaller errors, of that with the usual ones, that speaks for them."""
+
+
+def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Scale, dict[str, Fit]]:
+    """Fits to all trials but one, and the scale of errors that predicts these best.
+
+    The usual errors are those of arms that creep, stick and settle. One that follows its pressure closely
+    tells so by its held trials, and the priors give way to them.
+    """
+
+    def error(held: Mapping[str, Fit]) -> float:
+        errors = {one.name: errors_of(held[one.name], one) for one in trials}
+        means = [mean_of(errors, name) for name in ("angle_by_pressure_rad", "angle_rad")]
+        return next((x for x in means if math.isfinite(x)), math.inf)
+
+    best = held_fits(trials, assembly, scale)
+    for finer in _FINER:
+        other = replace(scale, finer=finer)
+        held = held_fits(trials, assembly, other, best)
+        if error(held) > _WORTHWHILE * error(best):
+            break
+        scale, best = other, held
+    return scale, best
+
+
 def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Errors]) -> float:
     inside = total = 0
     for one in trials:
@@ -385,7 +438,7 @@ def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[
         made = held[one.name]
         off = by_command(one, values_on(one.day, made.values, made.days))["angle_rad"]
         inside += int(np.sum(np.abs(off) <= wide))
-        total += len(one.angle_rad)
+        total += len(off)
     return inside / total if total else math.nan
 
 
@@ -470,9 +523,9 @@ def identify(
         variants["a lag for the valve"] = assembly.driven_by("lag")
     chosen = variants if compare and len(trials) > 1 else {}
     steps = 2 + len(chosen)
-    made = fit(trials, assembly, scale)
+    scale, held = _held(trials, assembly, scale) if len(trials) > 1 else (scale, {})
     progress(1, steps)
-    held = held_fits(trials, assembly, scale) if len(trials) > 1 else {}
+    made = fit(trials, assembly, scale)
     errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
     progress(2, steps)
     others: dict[str, Mapping[str, Errors]] = {}

@@ -19,14 +19,14 @@ Segment: the chamber of the arm fills, p_f, with the fill time. The angle phi [r
 with one viscous lag; inertia plays no part at the speeds of such arms. Pressure stiffens, so that the moments
 of pressure, load and hysteresis bend less under it. w is a stop, the elastic part of the angle's changes, of
 at most the hysteresis' range; c creeps after the angle; s is by how much the chord is too short at the start,
-as of an arm that was vented:
+as of an arm that was vented, and s' is that of the chord, which recovers in a time of its own:
 
     dp_f/dt = (p - p_f) / t_f
     tau dphi/dt = phi_0 + (a p_f + C M(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
-    dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s
+    dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s,  s' as s
 
 M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of
-length l, whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s.
+length l, whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s'.
 
 What differs from day to day is a factor of a, and of D or G: an arm is refitted, its rubber rests, and so do
 the valve's springs.
@@ -42,7 +42,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
 from calib.core.units import GRAVITY_MPS2
 
@@ -50,6 +50,8 @@ STEP_S = 0.02
 """Of the free run; a tenth of the fastest lag that pressures and motion capture at 90 Hz show."""
 _FINER = 4
 """Steps of the valve in one of these: a port opens within a few milliseconds."""
+_BEGINS = 3
+"""Steps whose median is the start of a free run."""
 _AIR_KPA = 101.3
 _CRITICAL = 0.3
 _LEANS = 0.55
@@ -58,13 +60,15 @@ _LEANS = 0.55
 @dataclass(frozen=True)
 class Scale:
     """Size of what logs hold, in which priors are stated: greatest pressure [kPa], range of the angle [rad],
-    greatest chord [m], the angle at rest [rad], and the greatest command [kPa or PWM]."""
+    greatest chord [m], the angle at rest [rad], and the greatest command [kPa or PWM]; and by how many times
+    errors are smaller than what assemblies usually leave."""
 
     pressure_kpa: float
     angle_rad: float
     chord_m: float
     rest_rad: float
     command: float
+    finer: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,20 @@ class Parameter:
 
     def value(self, z: float, scale: Scale) -> float:
         """The number at z standard deviations of the prior from its centre."""
-        p, a, c, u = self.powers
-        size = scale.pressure_kpa**p * scale.angle_rad**a * scale.chord_m**c * scale.command**u
         if self.positive:
-            return size * self.centre * math.exp(self.spread * z)
+            return self._size(scale) * self.centre * math.exp(self.spread * z)
         offset = scale.rest_rad if self.name == "rest_rad" else 0.0
-        return offset + size * (self.centre + self.spread * z)
+        return offset + self._size(scale) * (self.centre + self.spread * z)
+
+    def times(self, z: float, factor: float, scale: Scale) -> float:
+        """Standard deviations of the number at z times a factor."""
+        if self.positive:
+            return z + math.log(factor) / self.spread
+        return (factor * self.value(z, scale) / self._size(scale) - self.centre) / self.spread
+
+    def _size(self, scale: Scale) -> float:
+        p, a, c, u = self.powers
+        return float(scale.pressure_kpa**p * scale.angle_rad**a * scale.chord_m**c * scale.command**u)
 
 
 @dataclass(frozen=True)
@@ -201,6 +213,10 @@ PARTS = (
             Parameter("chord_m", "m", 1.0, 0.02, powers=(0, 0, 1, 0), identified_by="the tip's position"),
             Parameter("chord_m_per_rad", "m/rad", -0.05, 0.05, powers=(0, -1, 1, 0), identified_by=_SLOW),
             Parameter("chord_m_per_rad2", "m/rad²", -0.07, 0.05, powers=(0, -2, 1, 0), identified_by=_SLOW),
+            Parameter("lengthens_s", "s", 4.0, 0.5, True, identified_by="vented starts"),
+            Parameter(
+                "lengthens_per_kpa", "1/kPa", 1.2, 0.8, powers=(-1, 0, 0, 0), identified_by="vented starts"
+            ),
         ),
         {},
     ),
@@ -210,6 +226,7 @@ PARTS = (
 PARAMETERS = tuple(one for part in PARTS for one in part.parameters)
 DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PARTS if part.drives}
 """Parameters of the parts that make the pressure."""
+CHORD = tuple(one.name for part in PARTS if part.name == "chord" for one in part.parameters)
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
 DAILY = {"pilot_drains": 0.1, "kpa_per_command": 0.1, "bends_rad_per_kpa": 0.15}
 """Parameters that differ from day to day, and standard deviations of the logarithms of a day's factors."""
@@ -228,6 +245,7 @@ class Trial:
     pressure_kpa : (n,) of the driven chamber, empty where it was not logged.
     angle_rad, chord_m : (n,) of the tip, empty without motion capture.
     pwm : whether the command is a PWM value in place of a pressure.
+    unseen : rows (n,) between poses that are far apart, None without any.
     """
 
     name: str
@@ -239,6 +257,12 @@ class Trial:
     angle_rad: FloatArray
     chord_m: FloatArray
     pwm: bool = False
+    unseen: BoolArray | None = None
+
+
+def begun(values: FloatArray) -> float:
+    """What a signal (n,) starts from: a single reading may be none."""
+    return float(np.median(values[:_BEGINS]))
 
 
 @kernel()
@@ -300,15 +324,15 @@ def _lag(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
 @kernel()
 def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, moment: float) -> FloatArray:
     rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
-    compliance, c0, c1, c2 = q[12:]
+    compliance, c0, c1, c2, lengthens_s, longer = q[12:]
     out = np.empty((len(pressure), 2))
-    short = c0 + c1 * angle + c2 * angle * angle - chord
+    short = lacks = c0 + c1 * angle + c2 * angle * angle - chord
     elastic, crept = 0.0, 0.0
     inside = pressure[0]
     follows, fills = 1.0 - math.exp(-STEP_S / lag), 1.0 - math.exp(-STEP_S / fill)
     for k in range(len(pressure)):
         out[k, 0] = angle
-        out[k, 1] = c0 + c1 * angle + c2 * angle * angle - short
+        out[k, 1] = c0 + c1 * angle + c2 * angle * angle - lacks
         inside += fills * (pressure[k] - inside)
         bends = linear * inside + compliance * moment * math.sin(_LEANS * angle) - stop * elastic / reach
         aim = rest + bends / max(1.0 + stiffens * inside, 0.1)
@@ -317,6 +341,7 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         elastic = min(max(elastic + change, -reach), reach)
         crept += STEP_S / creep_s * (angle - rest - crept)
         short -= STEP_S / settling_s * short * math.exp(min(sooner * inside, 5.0))
+        lacks -= STEP_S / lengthens_s * lacks * math.exp(min(longer * inside, 5.0))
     return out
 
 
@@ -330,11 +355,11 @@ def values_on(day: str, values: Mapping[str, float], days: Days) -> dict[str, fl
 
 
 def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
-    """Pressure [kPa] (n,) that follows from a trial's command and from its first reading alone.
+    """Pressure [kPa] (n,) that follows from a trial's command and from its first readings alone.
 
     The drive is the one whose parameters are among `values`.
     """
-    start = trial.pressure_kpa[0] if len(trial.pressure_kpa) else 0.0
+    start = begun(trial.pressure_kpa) if len(trial.pressure_kpa) else 0.0
     name = next(one for one, names in DRIVES.items() if names[0] in values)
     q = np.array([values[one] for one in DRIVES[name]])
     return np.asarray((_valve if name == "valve" else _lag)(trial.command, start, q))
@@ -343,10 +368,10 @@ def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
 def segment_run(
     trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first pose."""
+    """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first poses."""
     q = np.array([values[name] for name in SEGMENT])
     moment = trial.load_kg * GRAVITY_MPS2 * values["chord_m"]
-    out = _segment(pressure_kpa, trial.angle_rad[0], trial.chord_m[0], q, moment)
+    out = _segment(pressure_kpa, begun(trial.angle_rad), begun(trial.chord_m), q, moment)
     return out[:, 0], out[:, 1]
 
 

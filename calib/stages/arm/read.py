@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.io.columns import COMMANDED, POSITION, PRESSURES, PWM, QUATERNION
@@ -28,8 +28,19 @@ _JUMP_RAD = math.radians(0.7)
 _TILTED_RAD = math.radians(5.0)
 _LEAST_TURN_RAD = math.radians(2.0)
 _NO_PLANE_RAD = math.radians(45.0)
-_LONGEST_M, _MOST_KPA, _LEAST_KPA = 3.0, 2000.0, 5.0
-"""No soft arm is so long or takes so much; hardly one bends by so little."""
+_LONGEST_M, _MOST_KPA, _LEAST_KPA, _MOST_TURN_RAD = 3.0, 2000.0, 5.0, 2.0 * math.pi
+"""No soft arm is so long, takes so much or rolls up twice; hardly one bends by so little a pressure."""
+_JUMP_SHARE = 0.03
+"""Of the chord, between neighbours."""
+_STILL, _MOVES = 1e-9, 0.2
+_FROZEN_S = {"pressure": 1.0, "pose": 1.0, "command": 10.0}
+"""A signal that keeps its value to the digit for so long, while what it follows goes through this share of
+its range, is frozen; a command may be held, while the pressure settles for a part of that."""
+_UNSEEN_S, _UNKNOWN_S = 0.3, 1.0
+"""Gaps over which poses are not counted, and over which nobody knows the command or the pressure."""
+_TURNED_OFF_RAD = math.radians(45.0)
+_LEAST_SHARE = 0.1
+"""Of the greatest change of a chamber, below which the change of another is noise."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +49,7 @@ class Frame:
 
     Attributes
     ----------
-    axis : (3,) of the bending, in the frame of the base; None for poses in the plane.
+    axis : (3,) of the bending, in the frame of the base; along z for poses in the plane, None without poses.
     conjugated : whether quaternions map the world to the body.
     leans : turn of the chord over that of the tip.
     planar_deg : angle between the axis and the normal of the tip's path.
@@ -110,16 +121,22 @@ def _frozen(log: Log, name: str, driven: int) -> Iterator[Finding]:
 
 
 def _varies(log: Log, name: str) -> bool:
-    return bool(np.nanmax(log.columns[name]) > np.nanmin(log.columns[name]))
+    return _range(log.columns[name]) > 0.0
+
+
+def _range(values: FloatArray) -> float:
+    """Greatest less least value (n,) or column (n, k) that is there; 0 without any."""
+    seen = values[np.isfinite(values).reshape(len(values), -1).all(axis=1)]
+    return float(np.ptp(seen, axis=0).max()) if len(seen) else 0.0
 
 
 def _driven(log: Log) -> int:
     """Number of the driven chamber from 0. Raises `BadInputError` where none or several are."""
     for names in (COMMANDED, PWM, PRESSURES):
-        moving = [
-            k for k, n in enumerate(names)
-            if n in log.columns and np.isfinite(log.columns[n]).any() and _varies(log, n)
-        ]  # fmt: skip
+        change = [_range(log.columns[n]) if n in log.columns else 0.0 for n in names]
+        # A sensor of a chamber that nobody drives is noisy too.
+        least = _LEAST_SHARE * max(change) if names is PRESSURES else 0.0
+        moving = [k for k, one in enumerate(change) if one > least]
         if len(moving) == 1:
             return moving[0]
         if moving:
@@ -144,24 +161,76 @@ def recording_of(log: Log, name: str) -> Recording:
     turned = chord = planar = None
     if all(one in log.columns for one in (*POSITION, *QUATERNION)):
         turned, chord = _poses(log)
-        findings += _jumps(log, name, turned)
+        findings += _jumps(log, name, turned, chord)
     elif all(one in log.columns for one in _PLANAR):
         x, y, phi = (log.columns[one] for one in _PLANAR)
-        planar = np.stack([phi, np.hypot(x, y)], axis=1)
-        findings += _jumps(log, name, phi[:, None])
+        apart = np.stack([x - log.columns.get("base_x_m", 0.0), y - log.columns.get("base_y_m", 0.0)], axis=1)
+        planar = np.stack([phi, np.hypot(*apart.T)], axis=1)
+        findings += _jumps(log, name, phi[:, None], apart)
     command, pressure = (log.columns.get(names[driven]) for names in (COMMANDED, PRESSURES))
     pwm = command is None and driven < len(PWM) and PWM[driven] in log.columns
     if pwm:
         command = log.columns[PWM[driven]]
     made = Recording(name, log.source, t, command, pressure, turned, chord, planar, tuple(findings), pwm)
-    return replace(made, findings=(*findings, *_in_units(made)))
+    return replace(made, findings=(*findings, *_in_units(made), *_stuck(made), *_unknown(made)))
+
+
+def _stuck(recording: Recording) -> Iterator[Finding]:
+    """Signals that keep their value while what they follow, or what follows them, moves."""
+    t = recording.t_s
+    poses = recording.turned if recording.planar is None else recording.planar
+    signals = {"command": recording.command, "pressure": recording.pressure, "pose": poses}
+    there = {name: values for name, values in signals.items() if values is not None and _range(values) > 0.0}
+    for name, values in there.items():
+        least_s = _FROZEN_S[name]
+        others = [other for other in there if other != name and (other != "pose" or name == "command")]
+        steps = np.abs(np.diff(values.reshape(len(values), -1), axis=0)).max(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], steps <= _STILL, [False]]).astype(np.int8)))
+        for first, last in edges.reshape(-1, 2).tolist():
+            if t[last] - t[first] < least_s:
+                continue
+            # What moved before the signal stood still may still arrive.
+            rows = slice(int(np.searchsorted(t, t[first] + 0.5 * least_s)), last + 1)
+            moved = [other for other in others if _range(there[other][rows]) > _MOVES * _range(there[other])]
+            if moved:
+                yield Finding(
+                    "poor",
+                    f"{recording.name}: its {name} stands still from {t[first] - t[0]:.1f} to "
+                    f"{t[last] - t[0]:.1f} s while its {moved[0]} moves: frozen",
+                    "leave that log out, or cut it before it freezes",
+                )
+                break
+
+
+def _unknown(recording: Recording) -> Iterator[Finding]:
+    """Stretches in which nothing tells what drove the arm."""
+    t = recording.t_s
+    for name, values in (("command", recording.command), ("pressure", recording.pressure)):
+        if values is None or not np.isfinite(values).any():
+            continue
+        at = t[np.isfinite(values)]
+        long = np.flatnonzero(np.diff(at) > _UNKNOWN_S)
+        if len(long):
+            first, last = at[long[0] : long[0] + 2] - t[0]
+            yield Finding(
+                "poor",
+                f"{recording.name}: has no {name} from {first:.1f} to {last:.1f} s, which a free run needs",
+                "split that log there",
+            )
 
 
 def _in_units(recording: Recording) -> list[Finding]:
     """What speaks of units other than metres and kPa. Raises `BadInputError` where no arm is so."""
     source, poses = recording.source, recording.chord
     chord = None if poses is None else np.linalg.norm(poses, axis=1)
-    chord = chord if recording.planar is None else recording.planar[:, 1]
+    if recording.planar is not None:
+        chord = recording.planar[:, 1]
+        most = float(np.nanmax(np.abs(recording.planar[:, 0]), initial=0.0))
+        if most > _MOST_TURN_RAD:
+            raise BadInputError(
+                f"{source}: tip_phi_rad reaches {most:.4g} rad, expected at most {_MOST_TURN_RAD:.2f}; "
+                "columns.yaml takes degrees, the column with unit: deg"
+            )
     if chord is not None and np.nanmedian(chord) > _LONGEST_M:
         raise BadInputError(
             f"{source}: base and tip are {float(np.nanmedian(chord)):.4g} m apart, expected at most "
@@ -184,15 +253,21 @@ def _in_units(recording: Recording) -> list[Finding]:
     return []
 
 
-def _jumps(log: Log, name: str, turned: FloatArray) -> Iterator[Finding]:
-    step = np.linalg.norm(np.diff(turned, axis=0), axis=1)
-    far = np.nonzero(step > _JUMP_RAD)[0]
-    if len(far):
-        yield Finding(
-            "remark",
-            f"{name}, line {log.lines[far[0] + 1]}: motion capture jumps by "
-            f"{math.degrees(step[far[0]]):.1f} deg from one sample to the next; {len(far)} such jumps in all",
-        )
+def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterator[Finding]:
+    """Steps of rotations (n, ...) [rad] and places (n, ...) [m] that no arm makes."""
+    step, moved = (np.linalg.norm(np.diff(one, axis=0), axis=1) for one in (turned, apart))
+    length = float(np.nanmedian(np.linalg.norm(apart, axis=1))) if np.isfinite(apart).any() else math.inf
+    for steps, least, scale, unit in (
+        (step, _JUMP_RAD, math.degrees(1.0), "deg"), (moved, _JUMP_SHARE * length, 1e3, "mm")
+    ):  # fmt: skip
+        far = np.nonzero(steps > least)[0]
+        if len(far):
+            yield Finding(
+                "remark",
+                f"{name}, line {log.lines[far[0] + 1]}: motion capture jumps by "
+                f"{scale * steps[far[0]]:.1f} {unit} from one sample to the next; {len(far)} such jumps "
+                "in all",
+            )
 
 
 def frame_of(recordings: Sequence[Recording]) -> Frame:
@@ -204,7 +279,8 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
         (one.turned, one.chord) for one in recordings if one.turned is not None and one.chord is not None
     ]
     if not with_poses:
-        return Frame(None)
+        angles = [one.planar[:, 0] for one in recordings if one.planar is not None]
+        return Frame(np.array([0.0, 0.0, _grows(np.concatenate(angles))]) if angles else None)
     turned, chord = (np.concatenate(parts) for parts in zip(*with_poses, strict=True))
     seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
     turned, chord = turned[seen], chord[seen]
@@ -231,13 +307,38 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
     conjugated = bool(leans < 0.0)
     straight = first * math.cos(offset) + side * math.sin(offset)
     # The angle grows with bending, whatever way that is.
-    if -float(np.percentile(angle, 1.0)) > float(np.percentile(angle, 99.0)):
-        axis = -axis
+    axis = _grows(angle) * axis
     return Frame(axis, conjugated, abs(float(leans)), planar, straight / np.linalg.norm(straight))
+
+
+def _grows(angle_rad: FloatArray) -> float:
+    """The sign with which angles (n,) grow with bending."""
+    low, high = np.nanpercentile(angle_rad, (1.0, 99.0))
+    return -1.0 if -low > high else 1.0
+
+
+def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
+    """Raise `BadInputError` for poses that turn about another axis than that of an identified arm."""
+    for one in recordings:
+        poses = one.turned if one.planar is None else one.planar[:, :1]
+        if frame.axis is None or poses is None or _range(poses) < 4.0 * _LEAST_TURN_RAD:
+            continue
+        axis = frame_of([one]).axis
+        off = 0.0 if axis is None else math.acos(min(max(float(axis @ frame.axis), -1.0), 1.0))
+        if off > _TURNED_OFF_RAD:
+            raise BadInputError(
+                f"{one.source}: its tip turns about an axis {math.degrees(off):.0f} deg from that of the arm "
+                "in the rig's file, expected the same arm and motion capture: look at the quaternions' order "
+                "and convention, and at the sign of an angle"
+            )
 
 
 def frame_findings(frame: Frame) -> Iterator[Finding]:
     """What the poses show of the arm and of the motion capture, in sentences."""
+    if frame.axis is not None and frame.direction is None and frame.axis[2] < 0.0:
+        yield Finding(
+            "remark", "tip_phi_rad falls as the arm bends; the angle is counted as it grows with bending"
+        )
     if frame.axis is None or frame.direction is None:
         return
     x, y, z = frame.axis
@@ -275,16 +376,30 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
     none = np.zeros(0)
     pressure = none if recording.pressure is None else _between(grid, t, recording.pressure)
     angle = chord = none
+    unseen = None
     if recording.turned is not None and recording.chord is not None and frame.axis is not None:
         angle = _between(grid, t, recording.turned @ frame.axis)
         chord = _between(grid, t, np.linalg.norm(recording.chord, axis=1))
+        unseen = _gaps(grid, t, recording.turned)
     elif recording.planar is not None:
         angle, chord = (_between(grid, t, column) for column in recording.planar.T)
+        angle = angle if frame.axis is None else frame.axis[2] * angle
+        unseen = _gaps(grid, t, recording.planar)
     command = none if recording.command is None else _means(grid, t, recording.command)
     if not len(pressure) and not len(angle):
         raise BadInputError(f"{recording.source}: has neither pressure nor pose, expected one of them")
-    rest = (grid - grid[0], command, pressure, angle, chord, recording.pwm)
+    rest = (grid - grid[0], command, pressure, angle, chord, recording.pwm, unseen)
     return Trial(recording.name, day, load_kg, *rest)
+
+
+def _gaps(grid: FloatArray, t: FloatArray, poses: FloatArray) -> BoolArray | None:
+    """Places of the grid (n,) between poses (m, k) that are far apart; None without any."""
+    at = t[np.isfinite(poses).all(axis=1)]
+    if len(at) < 2:
+        return None
+    after = np.clip(np.searchsorted(at, grid), 1, len(at) - 1)
+    far = (at[after] - at[after - 1] > _UNSEEN_S) | (grid < at[0]) | (grid > at[-1])
+    return far if far.any() else None
 
 
 def _between(grid: FloatArray, t: FloatArray, values: FloatArray) -> FloatArray:

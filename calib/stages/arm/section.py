@@ -65,8 +65,14 @@ class Arm(Result):
             for day, one in section.get("days", {}).items()
         }
         out, parameters = section | {"days": days}, section.get("parameters")
-        if isinstance(parameters, dict) and "leak_per_s" in parameters:
-            out["parameters"] = {"input_s": _AT_ONCE_S} | parameters
+        if not isinstance(parameters, dict):
+            return out
+        # In files of earlier versions the chord recovered as the angle settled, or not at all.
+        unknown = {"lengthens_s": parameters.get("settling_s", 1.0)}
+        unknown["lengthens_per_kpa"] = parameters.get("settling_per_kpa", 0.0)
+        if "leak_per_s" in parameters:
+            unknown["input_s"] = _AT_ONCE_S
+        out["parameters"] = unknown | parameters
         return out
 
     @model_validator(mode="after")

@@ -26,6 +26,10 @@ _UNTOLD = 0.8
 """Posterior over prior deviation above which logs tell nothing of a parameter."""
 _FAR = 2.0
 """A held trial is far from the others with this many times their median error."""
+_COARSE = 0.1
+"""Error of a held trial, of the angle's range, above which a prediction is none."""
+_MATTERS = 0.005
+"""Of the angle's range or the chord, by which a black box has to be better to count."""
 _SHORT = 0.01
 _LEAST_RAD = math.radians(0.5)
 
@@ -87,7 +91,7 @@ def read_trials(
     """
     from calib.core.units import parse_mass_kg
     from calib.io.logs import read_log
-    from calib.stages.arm.read import frame_findings, frame_of, recording_of, trial_of
+    from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
 
     names = [path.stem for path in files.paths]
     if len(set(names)) < len(names):
@@ -105,6 +109,8 @@ def read_trials(
                 f"{name}: is the same recording as {seen[digest]}, expected another trial; leave one out"
             )
         seen[digest] = name
+    if frame is not None:
+        check_frame(recordings, frame)
     found = frame_of(recordings) if frame is None else frame
     trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
     loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items()) or "none"
@@ -150,7 +156,8 @@ def _solve(inputs: Inputs) -> Arm:
 
 def judge(found: Identification) -> Iterator[Finding]:
     """What the held trials, the baselines and the posterior say of an identification."""
-    from calib.stages.arm.identify import QUANTITIES, best_baseline, gained
+    from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
+    from calib.stages.arm.model import begun
 
     if not any(len(one.angle_rad) for one in found.trials):
         yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
@@ -167,10 +174,21 @@ def judge(found: Identification) -> Iterator[Finding]:
         if math.isnan(mean):
             continue
         text = (
-            f"{one.words}: error on held trials {100.0 * mean:.0f} +- {100.0 * half:.0f} % smaller than "
-            f"that of {name} (paired, 95 %)"
+            f"{one.words}: error on held trials {100.0 * abs(mean):.0f} +- {100.0 * half:.0f} % "
+            f"{'smaller' if mean > 0.0 else 'larger'} than that of {name} (paired, 95 %)"
         )
-        yield Finding("remark" if mean > 0.0 else "poor", text)
+        scale = found.fit.scale
+        size = scale.chord_m if quantity == "chord_m" else scale.angle_rad
+        worse = -mean * mean_of(found.others[name], quantity) > _MATTERS * size
+        yield Finding("poor" if worse else "remark", text)
+    error, size = mean_of(found.held, "angle_rad"), found.fit.scale.angle_rad
+    if error > _COARSE * size:
+        yield Finding(
+            "poor",
+            f"held trials are predicted to {math.degrees(error):.1f} deg of a range of "
+            f"{math.degrees(size):.0f} deg",
+            "look at the logs' days, loads and units",
+        )
     yield from _far(found)
     yield from _untold(found)
     values = found.fit.values
@@ -183,9 +201,9 @@ def judge(found: Identification) -> Iterator[Finding]:
     for trial in found.trials:
         if not len(trial.angle_rad):
             continue
-        phi = float(trial.angle_rad[0])
+        phi = begun(trial.angle_rad)
         curve = values["chord_m"] + values["chord_m_per_rad"] * phi + values["chord_m_per_rad2"] * phi**2
-        short = curve - float(trial.chord_m[0])
+        short = curve - begun(trial.chord_m)
         if short > _SHORT * values["chord_m"]:
             yield Finding(
                 "remark", f"{trial.name} starts {1e3 * short:.1f} mm too short: a vented start, it settles"
@@ -304,6 +322,11 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
     from calib.stages.arm.read import Frame
 
     axis = arm.bending_axis
+    if options.load and "load" not in arm.parts:
+        raise UsageError(
+            "--load: the arm in the rig's file has no part load, expected one that was identified from a log "
+            "with a load too"
+        )
     trials, _, findings = read_trials(files, options, Frame(None if axis is None else np.array(axis)))
     files.remarks += [one.text for one in findings]
     files.remarks += [
