@@ -107,6 +107,11 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
     assert old is not None
     assert old.values_on("a")["bends_rad_per_kpa"] == pytest.approx(1.1)
     assert old.values_on("another")["bends_rad_per_kpa"] == pytest.approx(1.1)
+    fewer = {name: 2.0 for name in small.names if not name.startswith("lengthens")}
+    old = Rig.of({"schema": 2, "arm": section | {"verdict": "ok", "parameters": fewer}}, "rig.yaml").arm
+    assert old is not None
+    assert old.parameters == fewer
+    assert (old.values_on("a")["lengthens_s"], old.values_on("a")["lengthens_per_kpa"]) == (1.0, 0.0)
     with pytest.raises(BadInputError, match=r"expected factors of .*bends_rad_per_kpa, not of lag_s"):
         Rig.of({"arm": section | {"verdict": "ok", "days": {"a": {"lag_s": 1.1}}}}, "rig.yaml")
     with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):

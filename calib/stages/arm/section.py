@@ -11,6 +11,8 @@ from calib.stages.arm.model import DAILY, DRIVES, PARAMETERS, PARTS, Assembly, v
 
 _AT_ONCE_S = 1e-4
 """Input of a valve in files of earlier versions, which knew none."""
+_AS_SETTLING = {"lengthens_s": "settling_s", "lengthens_per_kpa": "settling_per_kpa"}
+"""Parameters that files of earlier versions lack: there the chord recovered as the angle settled."""
 
 
 class HeldTrial(Section):
@@ -65,14 +67,8 @@ class Arm(Result):
             for day, one in section.get("days", {}).items()
         }
         out, parameters = section | {"days": days}, section.get("parameters")
-        if not isinstance(parameters, dict):
-            return out
-        # In files of earlier versions the chord recovered as the angle settled, or not at all.
-        unknown = {"lengthens_s": parameters.get("settling_s", 1.0)}
-        unknown["lengthens_per_kpa"] = parameters.get("settling_per_kpa", 0.0)
-        if "leak_per_s" in parameters:
-            unknown["input_s"] = _AT_ONCE_S
-        out["parameters"] = unknown | parameters
+        if isinstance(parameters, dict) and "leak_per_s" in parameters:
+            out["parameters"] = {"input_s": _AT_ONCE_S} | parameters
         return out
 
     @model_validator(mode="after")
@@ -83,7 +79,7 @@ class Arm(Result):
             raise ValueError(f"expected parts of {', '.join(known)}, with {', '.join(needed)}")
         if sum(one in DRIVES for one in self.parts) != 1:
             raise ValueError(f"expected one part of {' and '.join(DRIVES)}")
-        if set(self.parameters) != set(self.assembly.names):
+        if set(self.parameters) | set(_AS_SETTLING) != set(self.assembly.names):
             raise ValueError("expected the parameters of its parts, all of them")
         strange = {name for day in self.days.values() for name in day} - set(DAILY)
         if strange:
@@ -100,4 +96,7 @@ class Arm(Result):
 
     def values_on(self, day: str) -> dict[str, float]:
         """All parameters on a day, those of parts that are left out included."""
-        return values_on(day, self.parameters | self.assembly.off, self.days)
+        values = self.parameters | self.assembly.off
+        for name, earlier in _AS_SETTLING.items():
+            values.setdefault(name, values[earlier])
+        return values_on(day, values, self.days)
