@@ -451,6 +451,15 @@ def test_the_first_corner_given_overrules_the_rule() -> None:
     truth = picture_placement(THESIS_PLACEMENT, 0.0, 170.0)
     by_rule = settle_orientation(truth, THESIS_PLACEMENT, 0.0)
     assert np.array_equal(by_rule.pixels, truth[::-1])
+    assert not by_rule.doubt
+    # Of a board whose colours tell its ends apart the detector begins where they say.
+    seen = picture_placement(ASYMMETRIC, 0.0, 170.0)
+    placement = settle_orientation(seen, ASYMMETRIC, 0.0, name="a.png")
+    assert np.array_equal(placement.pixels, seen[::-1])
+    u, v = seen[0]
+    assert placement.doubt.startswith("a.png: by the board's colours, dark across corner (0, 0), that corner")
+    assert f"({u:.1f}, {v:.1f})" in placement.doubt
+    assert not settle_orientation(seen[::-1], ASYMMETRIC, 0.0).doubt
     given = settle_orientation(
         truth[::-1], THESIS_PLACEMENT, 0.0, first_corner_px=truth[0] + np.array([2.0, -3.0])
     )
@@ -548,6 +557,15 @@ def test_squares_that_are_not_square_are_noticed() -> None:
     plane = calibrate_plane(THESIS, COVARIANCE, [View("a", WORLD, view.pixels)])
     assert plane.verdict.word == "poor"
     assert any("proportions of the board" in reason for reason in plane.verdict.reasons)
+
+
+@pytest.mark.parametrize(("stretch", "word"), [(1.0, "ok"), (1.001, "ok"), (1.005, "poor"), (0.99, "poor")])
+def test_a_stretch_of_the_board_counts_by_what_it_moves(stretch: float, word: str) -> None:
+    """Corners known to a hundredth of a pixel: half a percent is a tenth of a pixel, and .2 mm."""
+    view = picture_plane_checks("a", *pose_at(0.3, 0.25), 0.01, world=WORLD * np.array([1.0, stretch]))
+    seen = [View("a", WORLD, view.pixels)]
+    plane = calibrate_plane(THESIS, 1e-4 * COVARIANCE, seen, camera_rms_px=0.0141)
+    assert plane.verdict.word == word
 
 
 def test_a_picture_that_was_undistorted_before_is_told() -> None:

@@ -14,8 +14,8 @@ from sets import BAD, Recipe, camera_of, good_set, take
 
 from calib.core.errors import BadInputError
 from calib.core.verdict import Verdict
-from calib.stages.camera import intrinsics
-from calib.stages.camera.bundle import Calibration, calibrate, covariance, minimise
+from calib.stages.camera import checks, intrinsics
+from calib.stages.camera.bundle import Calibration, calibrate, covariance, minimise, rotation_exp
 from calib.stages.camera.checks import (
     FAULTS,
     Candidate,
@@ -31,6 +31,7 @@ from calib.stages.camera.checks import (
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import calibrate_camera, without_copies
 from calib.stages.camera.model import (
+    FISHEYE,
     MODELS,
     Board,
     Camera,
@@ -433,6 +434,38 @@ def test_what_is_no_view_of_a_plane_is_named() -> None:
     views[6] = replace(views[6], pixels=views[6].pixels[:, :1] * [1.0, 0.3] + 5.0)
     few, line, off_plane = FAULTS
     assert view_faults(pack(views)) == ["", off_plane, "", off_plane, line, few, line, ""]
+
+
+def test_boards_at_the_border_of_a_fisheye_are_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a homography has its horizon: 80 degrees and more from the axis."""
+    lens = np.array([-0.02, 0.003, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    camera = Camera(FISHEYE, (480, 480), 140.0, 140.0, 0.0, 240.0, 240.0, lens)
+    board = Board(7, 7, 0.02)
+    flat = np.column_stack([board.points_m() - 0.06, np.zeros(49)])
+    views = []
+    for k in range(12):
+        R = rotation_exp(np.array([[0.3 * np.cos(k), 0.3 * np.sin(k), 0.5 * k]]))[0]
+        place = np.array([0.008 * np.cos(2.0 * k), 0.008 * np.sin(2.0 * k), 0.034 + 0.002 * (k % 4)])
+        points = flat @ R.T + place
+        views.append(View(f"{k}", board.points_m(), project(camera, points)))
+    assert set(view_faults(pack(views))) == {""}
+    monkeypatch.setattr(checks, "_CUBIC", 1000)
+    assert set(view_faults(pack(views))) != {""}
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_near_and_far_views_that_differ_are_no_lens_that_moved(near: bool) -> None:
+    rng, camera = np.random.default_rng(3), camera_of()
+    other = replace(camera, fx_px=camera.fx_px * 1.02, fy_px=camera.fy_px * 1.02)
+    close, far = ((0.6, 0.7), (0.3, 0.4)) if near else ((0.3, 0.7), (0.3, 0.7))
+    views = take(rng, camera, 10, recipe=Recipe(fill=far))
+    views += take(rng, other, 10, recipe=Recipe(fill=close), prefix="w")
+    fit = _prepared(_fit_two_cameras(views))
+    split = best_split(fit)
+    assert split is not None
+    assert split.by_distance == near
+    word = _told(views).word
+    assert word == "inconsistent" if not near else word != "inconsistent"
 
 
 def test_a_bad_view_and_bad_points_are_found() -> None:

@@ -253,8 +253,9 @@ def cell_means(fit: Calibration, at: FloatArray, vectors: FloatArray, weights: F
 # Views that cannot be views of the plane, told from the correspondences alone.
 #
 # A plane seen through a lens follows a homography up to distortion, a smooth bulge of at most a tenth of
-# the board's extent in the picture. Points in another order, from another board or on one line do not, and
-# one such view can keep a whole calibration from finding a camera.
+# the board's extent in the picture, or near the border of a fisheye's, where a homography has its horizon,
+# any smooth map. Points in another order, from another board or on one line do not, and one such view can
+# keep a whole calibration from finding a camera.
 
 FAULTS = (
     "fewer than four points",
@@ -264,8 +265,12 @@ FAULTS = (
 """What a view may show that is no view of the plane."""
 _FLAT = 2e-3
 """Smaller over larger extent of a set of points below which they lie on a line."""
-_OFF_PLANE = 0.2
-"""Departure from a homography over the extent in the picture; 100 degrees of barrel make 0.1."""
+_OFF_PLANE, _OFF_SMOOTH = 0.2, 0.15
+"""Departure from a homography, and from a cubic map, over the extent in the picture."""
+_ONE_SIDE = 0.3
+"""Points where that map shows the board's front, less those where it shows its back, over all."""
+_CUBIC = 20
+"""Points that tell a cubic map, twice its terms."""
 
 
 def _flatness(points: FloatArray, present: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -276,6 +281,20 @@ def _flatness(points: FloatArray, present: BoolArray) -> tuple[FloatArray, Float
     scatter = np.einsum("nmi,nmj->nij", off, off) / count[:, None, None]
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(scatter), 0.0))
     return values[:, 0] / np.maximum(values[:, 1], 1e-300), values[:, 1]
+
+
+def _smooth(target_m: FloatArray, pixels: FloatArray, most_px: float) -> bool:
+    """Whether a cubic map that hardly folds takes points (M, 2) to pixels (M, 2), to so much [px] RMS."""
+    x, y = ((target_m - target_m.mean(axis=0)) / np.ptp(target_m, axis=0).max()).T
+    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    terms = np.stack([x**i * y**j for i, j in powers], axis=1)
+    by_x = np.stack([i * x ** max(i - 1, 0) * y**j for i, j in powers], axis=1)
+    by_y = np.stack([j * x**i * y ** max(j - 1, 0) for i, j in powers], axis=1)
+    found = np.linalg.lstsq(terms, pixels, rcond=None)[0]
+    (a, b), (c, d) = (by_x @ found).T, (by_y @ found).T
+    turns = np.sign(a * d - b * c)
+    off = ((pixels - terms @ found) ** 2).sum(axis=1)
+    return bool(abs(turns.mean()) > _ONE_SIDE and off.mean() < most_px**2)
 
 
 def view_faults(observations: Observations) -> list[str]:
@@ -296,6 +315,9 @@ def view_faults(observations: Observations) -> list[str]:
         off = np.where(chosen.present, ((mapped[..., :2] / depth - chosen.pixels) ** 2).sum(axis=2), 0.0)
         rms = np.sqrt(off.sum(axis=1) / chosen.present.sum(axis=1))
         off_plane[usable] = rms > _OFF_PLANE * np.maximum(extent[usable], 1e-300)
+        for i in np.flatnonzero(off_plane & (present.sum(axis=1) >= _CUBIC)):
+            seen = present[i]
+            off_plane[i] = not _smooth(target[i, seen, :2], pixels[i, seen], _OFF_SMOOTH * extent[i])
     return list(np.select([few, line, off_plane], FAULTS, ""))
 
 
@@ -464,6 +486,8 @@ def overdispersion(found: Evidence) -> float:
 # Gauss-Newton step from the solution, poses and intrinsics following, gives each with its standard
 # deviation; the problem is close to linear in deformations that are small beside the distance.
 
+_CERTAIN = 4.0
+"""Standard deviations of a deformation beyond which it is there."""
 DEFORMATIONS = ("aspect", "shear", "bow_x", "bow_y", "twist")
 
 
@@ -477,7 +501,7 @@ class TargetShape:
     bow_m : largest departure from flatness between the target's middle and its border.
     bow_significance : square root of the Wald statistic of the three bows, over its degrees of freedom.
     size_m : longer side of the target.
-    focal_shift : share by which fx would move.
+    shift : (P,) by how much the intrinsics would move. focal_shift : share by which fx would.
     focal_per_bow : share by which fx moves for a bow of half a percent of the target's size.
     values, sigma : (5,) in the order of `DEFORMATIONS`; slopes, and metres for bows and twist.
     displacement_m : (M, 3) or (N, M, 3) of the target's points, all five together.
@@ -488,11 +512,17 @@ class TargetShape:
     bow_m: float
     bow_significance: float
     size_m: float
+    shift: FloatArray
     focal_shift: float
     focal_per_bow: float
     values: FloatArray
     sigma: FloatArray
     displacement_m: FloatArray
+
+    @property
+    def certain(self) -> bool:
+        """Whether the target is not what it is said to be."""
+        return bool(np.any(np.abs(self.values) > _CERTAIN * self.sigma))
 
 
 def _basis(calibration: Calibration) -> tuple[FloatArray, float]:
@@ -536,6 +566,7 @@ def target_shape(calibration: Calibration) -> TargetShape | None:
         bow_m=float(np.ptp(np.tensordot(bows, basis[..., 2:, 2, :], axes=(0, basis.ndim - 3)))),
         bow_significance=float(np.sqrt(wald / 3)),
         size_m=2 * half,
+        shift=step[:P],
         focal_shift=float(step[fx_at] / fx),
         focal_per_bow=float(np.abs(row[2:4]).max() * 0.01 * half / fx),
         values=step[P:],
@@ -695,6 +726,8 @@ _LEAST_IN_ALL = 8
 """Of fewer any three may differ from the rest by what is odd about each."""
 _IN_ORDER = 0.9
 """Statistic of a split in order over that of any, each over its chance, from which on it is taken."""
+_AS_WELL = 0.8
+"""Statistic of a split by distance over that of the best, from which on distance explains it."""
 _ODD_VIEWS = 6
 """Views without each of which the finding has to stand."""
 _PRIOR = {"fx_px": 0.3, "fy_px": 0.3, "cx_px": 0.15, "cy_px": 0.15, "skew_px": 0.05}
@@ -715,6 +748,8 @@ class Split:
         them, one turned to meet the other.
     difference : intrinsics of the second group less those of the first, by name.
     sigma : its standard deviation with the overdispersion within the groups, by name.
+    by_distance : whether near and far views differ about as much, as with a lens or a board that the model
+        does not follow.
     """
 
     second: BoolArray
@@ -723,6 +758,7 @@ class Split:
     apart_px: float
     difference: dict[str, float]
     sigma: dict[str, float]
+    by_distance: bool = False
 
     @property
     def in_order(self) -> bool:
@@ -934,7 +970,11 @@ def best_split(calibration: Calibration) -> Split | None:
     if not ordered and best.sum() > len(best) / 2:
         best = ~best
     ratio = float(statistics[k]) / max(float(chances[k]), 1e-9)
-    return _described(problem, scale, calibration, best, ratio)
+    far = np.argsort(np.argsort(np.linalg.norm(calibration.block.t_CT_m, axis=1)))
+    at = np.arange(_LEAST, len(best) - _LEAST + 1)
+    explained = float(_statistic(problem, far >= at[:, None])[0].max())
+    by_distance = explained > _AS_WELL * float(_statistic(problem, best[None])[0][0])
+    return replace(_described(problem, scale, calibration, best, ratio), by_distance=by_distance)
 
 
 # ----------------------------------------------------------------------

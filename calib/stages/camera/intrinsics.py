@@ -37,6 +37,8 @@ from calib.stages.camera.checks import (
     scaled_inverse,
     seen_angles,
     skew_left_out,
+    straightened,
+    target_shape,
     view_faults,
 )
 from calib.stages.camera.model import (
@@ -550,9 +552,7 @@ def calibrate_camera(
     unusable += copies
     sorted_out, models = _sorted_out(everything, image_size_px, choices)
     of_all = sorted_out.everything
-    turned = turned_views(of_all)
-    if turned and _bent(of_all, turned):
-        turned = []
+    turned = turned_views(_flattened(of_all) or of_all)
     by_name = {one.name for one in turned}
     if turned and not choices.keep_all:
         everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
@@ -623,16 +623,37 @@ def without_copies(
     return observations.select(sorted(own.values())), copies
 
 
-def _bent(fit: Calibration, turned: Sequence[LeftOut]) -> bool:
-    """Whether a board that is not flat explains all views better than a flat one those that are not turned.
+def _flattened(fit: Calibration) -> Calibration | None:
+    """The fit to a board of the shape that all views tell, None where they tell none.
 
-    A bow moves the principal point of a view with the sign of its tilt, as turning a picture does.
+    A bow or a stretch moves the principal point of a view with its tilt, as another camera or a picture that
+    was turned does.
     """
-    if not fit.observations.same_target:
-        return False
-    others = np.flatnonzero(~np.isin(fit.observations.names, [one.name for one in turned]))
-    warped = refitted(fit, basis=board_basis(fit.observations.target_m[0], "warp"))
-    return warped.rms_px < refitted(fit, others).rms_px
+    shape = target_shape(fit) if np.all(np.isfinite(fit.normal)) else None
+    if shape is None or not shape.certain:
+        return None
+    flat = straightened(fit, shape.displacement_m)
+    return None if flat is fit else flat
+
+
+def _screened(fit: Calibration) -> Triage:
+    """The views that agree: on a board as it is described, or of another shape where more agree on that."""
+    found = triage(fit)
+    everything, gone = fit.observations, {one.name for one in found.left_out if one.kind == "view"}
+    for source in (fit, found.calibration) if gone else ():
+        shape = target_shape(source)
+        if shape is None or not shape.certain:
+            continue
+        other = triage(straightened(fit, shape.displacement_m))
+        leaving = {one.name for one in other.left_out if one.kind == "view"}
+        if len(leaving) >= len(gone):
+            continue
+        kept = np.flatnonzero(~np.isin(everything.names, list(leaving)))
+        some = everything.select(kept)
+        seen = some.without(some.present & ~other.calibration.observations.present)
+        rigid = refitted(replace(fit, observations=everything), kept, observations=seen)
+        found, gone = Triage(rigid, fit, other.left_out, other.scale_px), leaving
+    return found
 
 
 def _moved_px(found: Triage) -> float:
@@ -653,7 +674,7 @@ def _sorted_out(
 
     def by(lens: LensModel, start: Block | None = None) -> Triage:
         fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=start)
-        return Triage.of_all(fit) if fit.termination == "behind the camera" else triage(fit)
+        return Triage.of_all(fit) if fit.termination == "behind the camera" else _screened(fit)
 
     observations, before = everything, None
     for _ in range(_TRIAGES):
@@ -690,17 +711,29 @@ def _better_for_most(lens: str, models: Sequence[Candidate]) -> Candidate | None
     return best if far else None
 
 
+_TELL_SHAPE = 4
+"""Views from which on the board's shape is told from the poses."""
+
+
 def _by_the_views(fit: Calibration) -> Covariance:
     """The covariance by which the views really scatter.
 
     Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
-    noise of their corners would let them: two to three times as much on real pictures.
+    noise of their corners would let them: two to three times as much on real pictures. A board that is not
+    as described moves the camera by as much as it would if the board's shape were estimated too.
     """
     try:
         inflation = overdispersion(evidence(fit, fit.basis))
+        tells = fit.basis is None and fit.observations.views >= _TELL_SHAPE
+        shape = target_shape(fit) if tells else None
     except (np.linalg.LinAlgError, ValueError):
-        inflation = 1.0
-    return covariance(fit, (inflation * fit.sigma_px) ** 2)
+        inflation, shape = 1.0, None
+    known = covariance(fit, (inflation * fit.sigma_px) ** 2)
+    if shape is None or not shape.certain:
+        return known
+    joint, P = known.joint.copy(), len(shape.shift)
+    joint[:P, :P] += np.outer(shape.shift, shape.shift)
+    return replace(known, intrinsics=known.intrinsics + np.outer(shape.shift, shape.shift), joint=joint)
 
 
 def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:

@@ -129,6 +129,8 @@ _STRAIGHT_PX = 0.03
 """Against the camera's own RMS: this many times as large, and large enough to matter."""
 _HOMOGRAPHY_FACTOR, _HOMOGRAPHY_POINTS = 2.0, 10
 """A homography that is free to bend to the pixels must not fit this much better than the pose."""
+_OFF_SIGMAS, _OFF_SHARE = 3.0, 5e-4
+"""Nor put corners so many standard deviations of the calibration, and this share of the board, elsewhere."""
 _ELEVATION_LOST_DEG, _ELEVATION_POOR_DEG = 3.0, 15.0
 """Angle between the line of sight and the plane: an error across it grows with its inverse sine."""
 _SPREAD_LOST_PX = 1.5
@@ -267,11 +269,14 @@ def _of_residuals(camera: Camera, plane: Plane, camera_rms_px: float | None) -> 
         yield Finding("poor", "the fit of the pose did not converge")
     ideal = undistort(camera, pixels)
     usable = bool(np.isfinite(ideal).all())
-    free_rms = plain_rms = math.nan
+    free_rms = plain_rms = off_mm = math.nan
     if usable and len(pixels) >= _HOMOGRAPHY_POINTS and rms > _STRAIGHT_PX:
         free = fit_homography(world_m, ideal)
         seen = project(camera, np.column_stack([world_m, np.ones(len(world_m))]) @ free.H.T)
         free_rms = float(np.sqrt(np.mean(np.sum((seen - pixels) ** 2, axis=1))))
+        posed = plane_map(camera, plane.R_CW, plane.t_CW_m, pixels)
+        freed = apply_homography(np.asarray(np.linalg.inv(free.H)), ideal)
+        off_mm = 1e3 * float(np.linalg.norm(posed - freed, axis=1).max())
         plain_rms = fit_homography(world_m, pixels).rms_px
     if _HOMOGRAPHY_FACTOR * plain_rms < min(free_rms, rms):
         yield Finding(
@@ -295,12 +300,19 @@ def _of_residuals(camera: Camera, plane: Plane, camera_rms_px: float | None) -> 
     if not usable:
         folded = int((~np.isfinite(ideal).all(axis=1)).sum())
         yield Finding("poor", f"{folded} corners lie where the camera's lens model folds over")
-    elif rms > _RMS_NOTICED_PX and rms > _HOMOGRAPHY_FACTOR * free_rms:
-        text = (
-            f"a free homography fits to {free_rms:.2f} px where the pose fits to {rms:.2f} px: the "
-            "intrinsics or the proportions of the board are not the real ones"
-        )
-        yield Finding("poor", text)
+    elif rms > _HOMOGRAPHY_FACTOR * free_rms:
+        size_mm = 1e3 * float(np.hypot(*np.ptp(world_m, axis=0)))
+        # Were the board as described, the noise would be what a free map leaves.
+        plane_mm, lens_mm = plane.sigma.plane_mm * free_rms / rms, plane.sigma.intrinsics_mm
+        sigma_mm = np.linalg.norm(plane_mm if lens_mm is None else np.hypot(plane_mm, lens_mm), axis=1)
+        known_mm = float(np.nanmax(sigma_mm)) if np.isfinite(sigma_mm).any() else math.inf
+        if rms > _RMS_NOTICED_PX or off_mm > max(_OFF_SIGMAS * known_mm, _OFF_SHARE * size_mm):
+            text = (
+                f"a free homography fits to {free_rms:.2g} px where the pose fits to {rms:.2g} px, and puts "
+                f"corners up to {off_mm:.2g} mm elsewhere: the intrinsics or the proportions of the board "
+                "are not the real ones"
+            )
+            yield Finding("poor", text, "measure the printed squares along both sides; lay the board flat")
 
 
 def _of_horizon(camera: Camera, plane: Plane) -> Iterator[Finding]:
@@ -492,9 +504,10 @@ def moved_m(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray
 #
 #     X_W = first_corner + [[c, -s], [s, c]] (x, y),   c = cos(angle), s = sin(angle)
 #
-# A checkerboard looks the same after half a turn (a square one after a quarter), or the detector does
-# not care. No picture can settle that, so a rule does: the turn is taken that makes the world's x axis
-# point to the right in the picture, unless the user says where the first corner is seen.
+# Most checkerboards look the same after half a turn (a square one after a quarter), and of others nobody
+# knows from which end they were measured. So a rule settles that: the turn is taken that makes the world's x
+# axis point to the right in the picture, unless the user says where the first corner is seen. Where the
+# board's colours tell its ends apart, and say otherwise, the answer comes with that doubt.
 
 _UNDECIDED_DEG = 0.5
 """Two turns are told apart only when the axis is at least this far from the border between them."""
@@ -511,12 +524,14 @@ class Placement:
     x_axis_deg : direction of the world's x axis in the picture at the board's centre; 0 is right,
         90 is down.
     how : one sentence that says how the orientation was settled.
+    doubt : a sentence where the board's colours say otherwise, else empty.
     """
 
     pixels: FloatArray
     quarter_turns: int
     x_axis_deg: float
     how: str
+    doubt: str = ""
 
     def reordered(self, values: BoolArray, board: Board) -> BoolArray:
         """Values (columns * rows,) of the detected corners in the order of `pixels`."""
@@ -566,13 +581,13 @@ def settle_orientation(
     """Give the detected corners the board's own order, by a stated rule.
 
     Without `first_corner_px` the half turn (or, on a square board, the quarter turn) is chosen that
-    turns the *world's* x axis most to the right in the picture, whatever `angle_rad` is and whether
-    or not the colours could tell the corners apart. With it the corner (0, 0) is the one seen there,
-    which must be within half a square of it.
+    turns the *world's* x axis most to the right in the picture, whatever `angle_rad` is. With it the corner
+    (0, 0) is the one seen there, which must be within half a square of it.
 
     Parameters
     ----------
-    pixels : (columns * rows, 2) detected corners, row by row, of any turn but not mirrored.
+    pixels : (columns * rows, 2) detected corners, row by row, not mirrored; of any turn, but where the
+        colours tell the ends apart in the order that they say.
     angle_rad : direction of the board's columns axis in the world.
     first_corner_px : (u, v) of the corner (0, 0), distorted pixels.
     name : how messages call the picture.
@@ -599,13 +614,23 @@ def settle_orientation(
             "corner cannot be told; give first_corner_px: [u, v] in board.yaml"
         )
     limit = 90 if len(candidates) == 2 else 45
+    tells = (board.columns + board.rows) % 2 == 1
     looks = "looks the same after a quarter turn" if limit == 45 else "can be read from either end"
+    looks = "has ends of different colours" if tells else looks
     how = (
         f"The board {looks}; corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), so "
         f"that the world's x axis points {_words(degrees)} in the picture (rule: right to within {limit} "
         "degrees)."
     )
-    return Placement(chosen, turn, degrees, how)
+    doubt = ""
+    if tells and turn:
+        u, v = candidates[0][1][0]
+        doubt = (
+            f"{name}: by the board's colours, dark across corner (0, 0), that corner is at pixel "
+            f"({u:.1f}, {v:.1f}), by the world's x axis, which points right, at ({chosen[0, 0]:.1f}, "
+            f"{chosen[0, 1]:.1f})"
+        )
+    return Placement(chosen, turn, degrees, how, doubt)
 
 
 def _words(degrees: float) -> str:

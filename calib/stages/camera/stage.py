@@ -220,6 +220,7 @@ class PlaneInputs:
     views: Sequence[model.View]
     workspace_m: tuple[float, float, float, float]
     orientation: tuple[str, ...]
+    doubts: tuple[str, ...]
     left_out: tuple[LeftOut, ...]
     simulated: bool
 
@@ -265,7 +266,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
             stated.dictionary,
         )
     world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
-    views, orientation = [], []
+    views, orientation, doubts = [], [], list[str]()
     for view in search.views:
         pixels, kept, how = view.pixels, view.measured, "The board's markers say which corner is (0, 0)."
         assert kept is not None
@@ -274,11 +275,18 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
                 pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
             )
             pixels, kept, how = placed.pixels, placed.reordered(kept, search.board), placed.how
+            doubts += [placed.doubt] * bool(placed.doubt)
         views.append(View(view.name, world_m[kept], pixels[kept]))
         orientation.append(f"{view.name}: {how}")
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
     return PlaneInputs(
-        rig.camera, views, rig.workspace_m, tuple(orientation), search.left_out, stated.simulated
+        rig.camera,
+        views,
+        rig.workspace_m,
+        tuple(orientation),
+        tuple(doubts),
+        search.left_out,
+        stated.simulated,
     )
 
 
@@ -287,6 +295,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
     import numpy as np
 
     from calib.core.result import finite_or_none, judged
+    from calib.core.verdict import Finding, Verdict
     from calib.stages.camera.plane import calibrate_plane
     from calib.stages.camera.section import Plane
 
@@ -298,6 +307,10 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         workspace_m=inputs.workspace_m,
         camera_rms_px=inputs.camera.rms_px,
     )
+    doubts = [
+        Finding("poor", one, "state which it is with first_corner_px: [u, v] in board.yaml")
+        for one in inputs.doubts[:1]
+    ]
     sigma = np.sqrt(np.diag(fit.covariance))
     names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
     parts = ("intrinsics", "plane", "calibration", "quantisation", "total")
@@ -329,7 +342,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         points=len(fit.corners_m),
         orientation=" ".join(inputs.orientation),
         simulated=inputs.simulated,
-        **judged(fit.verdict),
+        **judged(Verdict.of([*fit.verdict.findings, *doubts])),
     ).with_evidence(PlaneEvidence(optics, fit, inputs.left_out))
 
 

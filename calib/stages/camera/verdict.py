@@ -613,6 +613,13 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
         )
         yield Finding("remark", text)
         return
+    if found.by_distance:
+        text = (
+            f"Views from near and from far differ about as much as {second} from the others {sure}: the lens "
+            "or the board is not quite as its model says."
+        )
+        yield Finding("remark", text, "Let the board's shape be fitted (--board warp), or try another model.")
+        return
     if found.in_order:
         what = "the lens was refocused or zoomed" if {"fx_px", "fy_px"} & set(telling) else "the lens moved"
         text = (
@@ -635,7 +642,7 @@ def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[
     )
     pixel = abs(calibration.camera.fx_px / calibration.camera.fy_px - 1.0)
     if off > Limits.aspect_remark and off > Limits.aspect_sigma * found.aspect_sigma:
-        text = f"{squares[0].upper()}{squares[1:]}, not square as said."
+        text = f"{squares[0].upper()}{squares[1:]}, not square as said; sigma allows for it."
         advice = "Measure the printed squares along both sides; print without scaling."
         yield Finding("inconsistent" if off > Limits.aspect_bad else "remark", text, advice)
     elif pixel > Limits.pixel_aspect:
@@ -654,7 +661,8 @@ def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[
         text = (
             f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
             f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
-            f"{100 * Limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %."
+            f"{100 * Limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %; "
+            "sigma allows for it."
         )
         kind: Severity = (
             "inconsistent" if bend > Limits.bow_bad else "poor" if moved > Limits.bow_focal else "remark"
