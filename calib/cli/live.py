@@ -76,9 +76,9 @@ def live(
     )
     album = Album(output)
     frames = source_of(source, album.images)
-    board, views = album.open(told)
+    board, views, size_px = album.open(told)
     stated = told.corners or (None if board.corners is None else (board.corners[0], board.corners[1]))
-    session = Session(stated, board.square_m if told.square_m is None else told.square_m)
+    session = Session(stated, board.square_m if told.square_m is None else told.square_m, size_px)
     session.views.update((view.name, view) for view in views)
     if views:
         narrate(f"{shown(album.images)}: going on with {len(views)} pictures")

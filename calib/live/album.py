@@ -63,8 +63,8 @@ class Album:
         """Pictures that are left out; sub-folders of a folder of pictures are not read."""
         return self.images / _DROPPED
 
-    def open(self, told: Told) -> tuple[BoardFile, tuple[View, ...]]:
-        """The board as far as it is known, and the views of an earlier session.
+    def open(self, told: Told) -> tuple[BoardFile, tuple[View, ...], tuple[int, int] | None]:
+        """The board as far as it is known, the views of an earlier session, and the size of its pictures.
 
         Raises `BadInputError` where the folder cannot be made or read, or tells another board than `told`.
         """
@@ -86,8 +86,9 @@ class Album:
                     f"{here}); give another folder for another board"
                 )
         if not holds_pictures(self.images):
-            return board, ()
-        return board, read_views([self.images], told).views
+            return board, (), None
+        found = read_views([self.images], told)
+        return board, found.views, found.image_size_px
 
     def names(self) -> list[str]:
         """Pictures that count, in the order in which they are read."""

@@ -177,8 +177,16 @@ def test_pictures_are_never_written_over_and_an_earlier_session_goes_on(
         album.drop(names[4])
     (album.images / names[4]).unlink()
     assert album.take_back(names[4]) and not album.drop("../rig.yaml") and album.picture("board.yaml") is None
-    board, views = album.open(Told())
-    assert board.corners == [7, 5] and [view.name for view in views] == names
+    # One of another size counts for nothing, though its name comes first.
+    other = render(CAMERA, background=0.4)
+    cv2.imwrite(str(album.images / "a.png"), other)
+    board, views, size_px = album.open(Told())
+    assert board.corners == [7, 5] and [view.name for view in views] == names and size_px == (316, 208)
+    live = Session((7, 5), size_px=size_px, views={view.name: view for view in views})
+    for seen in (live.look(other, 0.0), live.accept(other, "b.png", by_hand=True)):
+        assert isinstance(seen, Seen) and "sends 320x240 px, the pictures so far have 316x208" in seen.says
+    whole = cv2.imread(str(album.images / names[0]), cv2.IMREAD_GRAYSCALE)
+    assert live.look(np.asarray(whole, np.uint8), 1.0).code == "alike"
     with pytest.raises(BadInputError, match="tells another board than --corners"):
         album.open(Told(corners=(8, 5)))
 
@@ -233,8 +241,8 @@ def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
 @contextlib.contextmanager
 def served(folder: Path, source: Source | None = None, port: str | None = None) -> Iterator[Any]:
     album = Album(folder)
-    _, views = album.open(Told())
-    live = Live(Session(views={view.name: view for view in views}), album, source, port)
+    _, views, size_px = album.open(Told())
+    live = Live(Session(size_px=size_px, views={view.name: view for view in views}), album, source, port)
     ready, address = threading.Event(), list[str]()
 
     def tell(where: str) -> None:
@@ -376,6 +384,12 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
         wait(lambda: live.album.names() == ["view001.png"])
         second.send('{"do": "camera"}')
         heard(line, "lent")
+        with tab(live) as third:
+            heard(third, "state")
+            third.send('{"do": "camera"}')
+            heard(second, "lent")
+        # Who lends the camera is gone.
+        heard(second, "free")
         with contextlib.suppress(Exception):
             line.send(b"\xff\xd8" + bytes(MOST_BYTES))
             line.recv(timeout=PICTURE_S)
