@@ -85,13 +85,17 @@ _SHOWN = 4
 
 @dataclass(frozen=True)
 class Decision:
-    """The answer with its reasons, not yet escaped; `failed` when any stage has failed."""
+    """The answer with its reasons, not yet escaped; `failed` when any stage has failed.
+
+    `lacking` names what the firmware cannot do without and is not known, and why; "" where all is there.
+    """
 
     answer: str
     headline: str
     weak: tuple[str, ...]
     record: tuple[str, ...]
     failed: bool = False
+    lacking: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """For the document."""
@@ -113,15 +117,30 @@ class Decision:
 def decide(told: Mapping[str, Any], sections: Mapping[str, Any]) -> Decision:
     """The decision on a run: `told` is its summary, `sections` those of its rig.yaml."""
     jobs: Sequence[Mapping[str, Any]] = told.get("jobs", ())
-    answer, headline = _answer(jobs, sections, camera_only=not told.get("logs"))
+    camera_only = not told.get("logs")
+    lacking = _lacking(jobs, sections, camera_only)
+    answer, headline = _answer(jobs, sections, camera_only, lacking)
     if told.get("simulated"):
         headline = f"{headline}; the rig is a simulated one, so these numbers are for no real machine"
     failed = any(job["status"] in ("failed", "blocked") for job in jobs)
-    return Decision(answer, headline, tuple(_weak(jobs, sections)), tuple(_record(jobs, sections)), failed)
+    weak, record = tuple(_weak(jobs, sections)), tuple(_record(jobs, sections))
+    return Decision(answer, headline, weak, record, failed, lacking)
+
+
+def _lacking(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any], camera_only: bool) -> str:
+    optics = {name for name in ("camera", "plane") if name not in sections}
+    # Pictures alone are the calibration of a camera; whoever has logs wants states from them.
+    if camera_only and optics == {"plane"}:
+        return ""
+    found = [job for job in jobs if job["flashed"] and optics & set(job["writes"])]
+    if not found:
+        return ""
+    why = f": {found[0]['reason']}" if found[0]["status"] == "skipped" else ""
+    return f"{_titles(found, 'not known')}{why}"
 
 
 def _answer(
-    jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any], camera_only: bool
+    jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any], camera_only: bool, lacking: str
 ) -> tuple[str, str]:
     used = [job for job in jobs if job["flashed"]]
     broken = [job for job in used if job["status"] in ("failed", "blocked")]
@@ -129,37 +148,34 @@ def _answer(
         return "no", f"{_titles(broken)} failed"
     senseless = [job for job in used if job["status"] in _MEANINGLESS]
     if senseless:
-        return "no", f"the data do not support {_titles(senseless, plain=True)}"
+        return "no", f"the data do not support {_titles(senseless)}"
     made = [job for job in jobs if job["stage"] == "firmware"]
     if not made or made[0]["status"] not in ("ok", "poor"):
         why = made[0]["reason"] if made else "it was not asked for"
         return "no", f"there is no firmware: {why}"
+    # What is poor for want of it, as controllers without an actuator, is no answer.
+    if lacking:
+        return "not yet", lacking
     poor = [job for job in used if job["status"] == "poor"]
     if poor:
-        return "not yet", f"{_titles(poor)} too weak"
-    # Pictures alone are the calibration of a camera; whoever has logs wants states from them.
-    optics = {name for name in ("camera", "plane") if name not in sections}
-    if camera_only and optics == {"plane"}:
+        return "not yet", _titles(poor, "too weak")
+    if camera_only and "camera" in sections and "plane" not in sections:
         return "yes", "the camera is calibrated; the header holds it alone, without a plane and logs"
-    lacking = [job for job in used if optics & set(job["writes"])]
-    if lacking:
-        return "not yet", f"{_titles(lacking)} not known"
     if made[0]["status"] == "poor":
         return "not yet", str(made[0]["reason"])
     others = [job for job in jobs if job["status"] not in _FINE]
     if others:
-        return "with care", f"what the firmware uses is sound, but look at {_titles(others, plain=True)}"
+        return "with care", f"what the firmware uses is sound, but look at {_titles(others)}"
     if camera_only and "controller" not in sections:
         return "yes", "camera and plane are calibrated; the header holds them alone, and drives no pumps"
     return "yes", "every stage that had data passed its own quality gate"
 
 
-def _titles(jobs: Sequence[Mapping[str, Any]], plain: bool = False) -> str:
+def _titles(jobs: Sequence[Mapping[str, Any]], what: str = "") -> str:
+    """Headings of the jobs, as a sentence where it is said what they are."""
     names = list(dict.fromkeys(f"“{job['title']}”" for job in jobs))
     text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-    if plain:
-        return text
-    return f"{text} {'is' if len(names) == 1 else 'are'}" if jobs[0]["status"] == "poor" else text
+    return f"{text} {'is' if len(names) == 1 else 'are'} {what}" if what else text
 
 
 def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:

@@ -523,6 +523,9 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
     reasons = tuple(
         f"{job.step.title}: {job.reason}" for job in done.ended if job.status not in ("ok", "skipped")
     )
+    decision = done.decision
+    if kind == "run" and decision.lacking and not decision.failed:
+        reasons = (decision.lacking, *reasons)
     outcome = Outcome(
         name=spec.name,
         status=_STATUS.get(code, "failed"),

@@ -322,6 +322,19 @@ def test_without_a_plane_logs_cannot_be_flashed_and_pictures_alone_can() -> None
     assert (both.answer, "drives no pumps" in both.headline) == ("yes", True)
 
 
+def test_what_is_lacking_comes_before_what_is_poor_for_want_of_it() -> None:
+    told = _whole(imu_static="poor", firmware="poor") | {"logs": ["swing.csv"]}
+    told["jobs"][0] |= {"status": "skipped", "reason": "no pictures in images/"}
+    told["jobs"][1] |= {"status": "skipped", "reason": "needs camera: no pictures in images/"}
+    found = decide(told, {})
+    assert found.headline == "“Intrinsics” and “Extrinsics” are not known: no pictures in images/"
+    assert (found.answer, found.lacking) == ("not yet", found.headline)
+    assert decide(told, SECTIONS).headline == "“Imu-Static” is too weak"
+    # Of pictures alone a plane is not wanted, and a weak camera is weak.
+    told = _whole(intrinsics="poor", extrinsics="skipped") | {"logs": []}
+    assert decide(told, {"camera": {"verdict": "poor"}}).headline == "“Intrinsics” is too weak"
+
+
 def test_weak_points_are_grouped_by_reason() -> None:
     told = _whole()
     told["jobs"] += [_job("replay", "poor", log=f"{k}.csv", reason="the IMU is silent") for k in range(6)]
