@@ -123,7 +123,7 @@ def _kind_of(to: str) -> Kind:
 
 def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
     from calib.core.rig import Rig
-    from calib.stages.camera.formats import to_kalibr, to_opencv, to_ros
+    from calib.stages.camera.formats import lost_skew_px, to_kalibr, to_opencv, to_ros
 
     section = Rig.load(rig, missing_ok=True).needed("camera", rig)
     camera = section.optics
@@ -132,6 +132,11 @@ def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:
         "opencv": lambda: to_opencv(camera),
         "kalibr": lambda: to_kalibr(camera, name),
     }[to]()
+    if camera.skew_px != 0.0:
+        narrate(
+            f"{shown(rig)}: skew_px is {camera.skew_px:g}, which OpenCV's functions ignore: they are "
+            f"{lost_skew_px(camera):.2g} px off at the picture's border; calibrate with --no-skew for them"
+        )
     return text, section.verdict.word
 
 

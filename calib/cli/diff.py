@@ -78,8 +78,14 @@ def _tell(found: RigDiff, every: bool) -> None:
     for one in found.verdicts:
         say("verdict of {section}: {before} before, {after} after".format(**one))
     plane = found.plane
-    if plane is None:
-        say("no plane in both, or pictures of two sizes: no difference in millimetres")
+    if found.pictures_px is not None:
+        before, after = ("x".join(map(str, size)) for size in found.pictures_px)
+        say(
+            f"the cameras have pictures of two sizes, {before} px before and {after} px after: "
+            "their pixels are not compared, so that there is no difference in millimetres"
+        )
+    elif plane is None:
+        say("no plane in both, or none of the workspace in the picture: no difference in millimetres")
     else:
         bar = "" if not plane.sigma_mm else f", sigma {plane.sigma_mm:.4f} mm"
         say(

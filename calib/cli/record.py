@@ -80,6 +80,10 @@ def record(
     another log beside the first.
     """
     duration_s = None if duration is None else parse_duration_s(duration, "--duration")
+    if do != _ALL and output.suffix.lower() != ".csv" and not writes_through(output):
+        raise UsageError(
+            f"{shown(output)}: expected a name that ends in .csv; a folder goes with --do all alone"
+        )
     if do is None:
         _ticks(port, output, duration_s, ticks, baud, as_json)
         return

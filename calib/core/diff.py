@@ -31,6 +31,7 @@ _SAME = 1e-12
 _NOT_LEARNT = ("views", "points", "rms_px", "mean_error_px", "rms_mm", "pictures")
 _EVIDENCE = ("log.", "sigma_", "projection_sigma_", "drift.", "anti_windup.")
 """Keys, and beginnings of keys, that describe a calibration and are no constants."""
+_SIZE = "image_size_px"
 _GRID = (13, 9)
 
 
@@ -75,7 +76,8 @@ class RigDiff:
     Attributes
     ----------
     changes : constants that differ, by significance; those of one side only come last.
-    plane : None where a side has no camera or plane.
+    pictures_px : width and height of both cameras' pictures, where they differ.
+    plane : None where a side has no camera or plane, or the pictures differ in size.
     verdicts : "section", verdict "before" and "after", where they differ.
     only_before, only_after : sections of one side.
     others : keys by section that differ and hold no constants: choices, deviations, evidence.
@@ -85,6 +87,7 @@ class RigDiff:
     """
 
     changes: tuple[Change, ...]
+    pictures_px: tuple[tuple[int, ...], tuple[int, ...]] | None
     plane: PlaneChange | None
     verdicts: tuple[dict[str, str], ...]
     only_before: tuple[str, ...]
@@ -102,7 +105,8 @@ def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
     left, right = _by_name(a), _by_name(b)
     changes = [_change(left.get(key), right.get(key)) for key in dict.fromkeys([*left, *right])]
     differ = [change for change in changes if change is not None]
-    differ.sort(key=lambda c: (c.before is None or c.after is None, -(c.sigmas or 0.0)))
+    differ.sort(key=lambda c: (c.before is None or c.after is None, -_rank(c)))
+    sizes = [tuple(one.get("camera", {}).get(_SIZE, ())) for one in (a, b)]
     verdicts = [
         {"section": name, "before": str(one.get("verdict", "-")), "after": str(b[name].get("verdict", "-"))}
         for name, one in a.items()
@@ -110,6 +114,7 @@ def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
     ]
     return RigDiff(
         tuple(differ),
+        (sizes[0], sizes[1]) if all(sizes) and sizes[0] != sizes[1] else None,
         plane,
         tuple(verdicts),
         tuple(name for name in a if name not in b),
@@ -119,6 +124,10 @@ def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:
         len(left.keys() & right.keys()),
         any(one.significant for one in (*differ, plane) if one is not None),
     )
+
+
+def _rank(change: Change) -> float:
+    return math.inf if change.significant and change.sigmas is None else change.sigmas or 0.0
 
 
 def _by_name(sections: Mapping[str, Any]) -> dict[tuple[str, str], Constant]:
@@ -174,6 +183,9 @@ def _change(before: Constant | None, after: Constant | None) -> Change | None:
     sigma = math.hypot(before.sigma or 0.0, after.sigma or 0.0) if known else None
     sigmas = difference / sigma if sigma else None
     significant = None if sigmas is None else sigmas >= SIGNIFICANT
+    if one.name.startswith(_SIZE):
+        # Counted, not estimated: it needs no error bar.
+        significant = True
     return Change(one.section, one.name, one.unit, before.value, after.value, sigma, sigmas, significant)
 
 

@@ -354,6 +354,20 @@ def test_there_and_back(calib, rig, tmp_path, form: str) -> None:
     assert list(yaml.safe_load(other.read_text())["provenance"]["inputs"]["camera"]) == [file.name]
 
 
+@pytest.mark.parametrize("form", ["ros", "opencv"])
+def test_a_skew_that_readers_ignore_is_told(calib, rig, tmp_path, form: str) -> None:
+    file, skewed = tmp_path / "camera.yaml", tmp_path / "skewed.yaml"
+    assert "skew_px" not in calib("export", form, "--rig", rig, "-o", file).err
+    whole = yaml.safe_load(rig.read_text())
+    camera = whole["camera"]
+    camera["skew_px"] = 2.0
+    skewed.write_text(yaml.safe_dump({"schema": whole["schema"], "camera": camera}))
+    ended = calib("export", form, "--rig", skewed, "-o", file)
+    rows = max(camera["cy_px"], camera["image_size_px"][1] - 1 - camera["cy_px"])
+    assert ended.code == 0
+    assert f"they are {2.0 * rows / camera['fy_px']:.2g} px off at the picture's border" in ended.err
+
+
 def test_one_camera_of_a_chain_is_taken_and_the_others_are_named(calib, rig, tmp_path) -> None:
     file = tmp_path / "camchain.yaml"
     assert calib("export", "kalibr", "--rig", rig, "-o", file).code == 0

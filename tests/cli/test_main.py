@@ -366,5 +366,21 @@ def test_table_and_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "nothing beyond the error bars" in said
     diff(a, b, as_json=True)
     told = json.loads(capsys.readouterr().out)
-    assert told["significant"] is False and told["plane"] is None
+    assert told["significant"] is False and told["plane"] is None and told["pictures_px"] is None
     assert told["changes"][0]["sigmas"] == pytest.approx(0.1 / (0.03 * 2**0.5))
+
+
+@pytest.mark.parametrize("bar", ["0.03", "null"])
+def test_pictures_of_two_sizes_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str], bar: str) -> None:
+    """Even where a side has no error bars; with them the focal lengths do too."""
+    a, b = tmp_path / "a.yaml", tmp_path / "b.yaml"
+    a.write_text(RIG.format(fx=273.4))
+    text = RIG.format(fx=610).replace("[316, 208]", "[640, 480]")
+    b.write_text(text if bar == "0.03" else text.replace("sigma: {fx_px: 0.03}, ", ""))
+    diff(a, b)
+    said = capsys.readouterr().out
+    assert "pictures of two sizes, 316x208 px before and 640x480 px after" in said
+    assert f"in all: significant{'' if bar == '0.03' else '; 1 without error bars differs'}" in said
+    focal = next(line for line in said.splitlines() if "fx_px" in line)
+    assert focal.endswith(" significant" if bar == "0.03" else "no error bars")
+    assert said.splitlines()[2].split()[0] == "camera.image_size_px[0]"

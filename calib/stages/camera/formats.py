@@ -320,6 +320,13 @@ def from_opencv(text: str) -> Camera:
     return _camera((width, height), K, used, "camera_matrix", fisheye=bool(fisheye))
 
 
+def lost_skew_px(camera: Camera) -> float:
+    """By how much OpenCV's functions, which ignore the skew of K, are off at the picture's border, px."""
+    height = camera.image_size_px[1]
+    rows = max(abs(camera.cy_px), abs(height - 1 - camera.cy_px))
+    return abs(camera.skew_px) * rows / camera.fy_px
+
+
 def to_kalibr(camera: Camera, name: str = "cam0") -> str:
     """Kalibr camchain YAML with one camera, pinhole-radtan or for fisheye4 pinhole-equi.
 
