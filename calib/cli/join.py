@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +10,7 @@ import typer
 
 from calib.cli.common import JsonOption, RigOption, answer, check_log_name, narrate
 from calib.core.command import note_inputs
+from calib.core.errors import UsageError
 from calib.core.files import shown
 from calib.core.writing import check_writable
 
@@ -17,9 +19,14 @@ def join(
     camera: Annotated[Path, typer.Argument(help="Log with the marker, as calib track writes it.")],
     board: Annotated[Path, typer.Argument(help="Log with the IMU, and what else a board records.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Log to write, .csv or .parquet.")],
-    same_clock: Annotated[
-        bool, typer.Option("--same-clock", help="Both have one clock already; nothing is looked for.")
-    ] = False,
+    offset: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="To add to the pictures' times, as other logs of these clocks told; nothing is looked for.",
+        ),
+    ] = None,
+    same_clock: Annotated[bool, typer.Option("--same-clock", help="--offset 0.")] = False,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
@@ -27,16 +34,22 @@ def join(
 
     Finds how the clocks stand to each other by the motion that both saw, whatever the offset. With camera and
     plane in the rig's file the marker's way is an angle, and one swing suffices; without, move unevenly.
+    Begin both recordings before the first motion.
     """
     from calib.core.rig import Rig
     from calib.io.logs import LOG, beside, read_log, write_log
     from calib.stages.align.join import DRIFT_S, joined
 
+    if same_clock and offset is not None:
+        raise UsageError("--offset: does not go with --same-clock, which is --offset 0")
+    if offset is not None and not math.isfinite(offset):
+        raise UsageError(f"--offset: is {offset}, expected seconds")
     check_log_name(output)
     note_inputs([camera, board, *beside(camera), *beside(board)])
     check_writable(output, LOG)
     known = Rig.load(rig, missing_ok=True)
-    log, clocks, outside = joined(read_log(camera), read_log(board), known, shown(rig), same_clock)
+    given = 0.0 if same_clock else offset
+    log, clocks, outside = joined(read_log(camera), read_log(board), known, shown(rig), given)
     write_log(output, log)
     told: dict[str, Any] = {"log": shown(output), "rows": len(log), "outside": outside}
     lines = [f"{len(log)} rows written to {shown(output)}: t_s, {', '.join(log.columns)}"]

@@ -113,15 +113,26 @@ def delay_of(
 
 
 # ----------------------------------------------------------------------
-# Of two recordings, each with its clock. Both are differenced over `_OVER` steps of a grid, and all delays at
-# which more than half of motion and time is shared are tried. A swing repeats after each period but for its
-# size, so that the next best delay has to leave twice as much.
+# Of two recordings, each with its clock. Both are differenced over `_OVER` steps of a grid, and an offset is
+# looked for at the delays at which more than half of motion and time is shared. A swing repeats after each
+# period but for its size, so that every other delay has to leave twice as much: also those that share less,
+# since a recording that begins late shares little at the true one. Where the marker's place on the head is
+# not known sizes differ by a factor, and a size tells the period only where no factor up to `_SCALE` makes
+# up for it. Clocks that seem to drift by more than clocks do are swings that are held against others.
 
 _STEP_S, _OVER = 0.01, 10
 _GAP_S = 0.15
-_MOST_LEFT, _APART = 0.4, 0.5
-"""Share of the motion that may be left, and of what the next best delay leaves."""
+_MOST_LEFT, _APART, _ROUGHLY_APART = 0.4, 0.5, 0.95
+"""Share of the motion that may be left, and of what the next best delay leaves, without and with a factor."""
 _BESIDE_S = 0.1
+_NEAR = 3
+"""Steps by which a factor moves the best delay."""
+_SCALE = 1.2
+_RIVAL, _RIVAL_S = 0.3, 0.8
+"""Share of one record's motion, and time, that a delay has to share to count against another."""
+_NOTHING, _TINY = 1e-6, 1e-300
+_DRIFT_S, _DRIFT = 0.02, 2e-3
+"""Drift of clocks from half to half, and its share of a half, at most."""
 
 
 @dataclass(frozen=True)
@@ -152,13 +163,28 @@ def _on_grid(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     return at[middle : middle + len(rate)], rate, near[_OVER:] & near[:-_OVER]
 
 
-def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, scaled: bool) -> FloatArray:
-    """left (n,) at the delays 1 - len(seen) .. len(felt) - 1 of grids."""
+def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, most: float) -> tuple[FloatArray, BoolArray]:
+    """left (n,) at the delays 1 - len(seen) .. len(felt) - 1 of grids, and where half is shared.
+
+    Where too little is shared to say anything, all is left.
+
+    Parameters
+    ----------
+    most : factor in size between the records, or its reciprocal, at most; infinite for one of either sign.
+    """
     seen = np.where(known, seen - seen[known].mean(), 0.0)
     there, rows = np.ones(len(felt)), known.astype(np.float64)
-    sums = np.stack([correlate(felt, seen), correlate(felt**2, rows), correlate(there, seen**2)], axis=1)
-    sums[correlate(there, rows) <= 0.5 * float(rows.sum())] = 0.0
-    return shares(sums, scaled)[1]
+    cross, own = correlate(felt, seen), correlate(felt**2, rows)
+    total, shared = correlate(there, seen**2), correlate(there, rows)
+    part, own_part = (one / max(float(one.max()), _TINY) for one in (total, own))
+    counts = (np.maximum(part, own_part) > _RIVAL) & (shared * _STEP_S > _RIVAL_S)
+    # Sums of nothing are rounding errors, of which any share is explained.
+    counts &= np.minimum(part, own_part) > _NOTHING
+    a = np.divide(cross, own, out=np.zeros(len(own)), where=counts)
+    a = np.clip(a, 1.0 / most, most) if most < np.inf else a
+    explained = np.divide(a * (2.0 * cross - a * own), total, out=np.zeros(len(own)), where=counts)
+    half = counts & (part > 0.5) & (shared > 0.5 * float(rows.sum()))
+    return np.clip(1.0 - explained, 0.0, 1.0), half
 
 
 def clocks(
@@ -176,20 +202,33 @@ def clocks(
     if known.sum() < 10 * _OVER or len(felt) < 10 * _OVER:
         return None
 
-    def offset(known: BoolArray) -> tuple[float, float, float]:
-        left = _left(seen, known, felt, scaled)
-        k = int(np.argmin(left))
-        beside = round(_BESIDE_S / _STEP_S)
-        others = np.concatenate([left[: max(k - beside, 0)], left[k + beside + 1 :], [1.0]])
+    beside = round(_BESIDE_S / _STEP_S)
+
+    def rival(left: FloatArray, k: int) -> float:
+        return float(np.concatenate([left[: max(k - beside, 0)], left[k + beside + 1 :], [1.0]]).min())
+
+    def offset(known: BoolArray) -> tuple[float, float, float, bool]:
+        """Offset, what it and its next leave, and whether that is clear."""
+        left, half = _left(seen, known, felt, 1.0 if scaled else np.inf)
+        k = int(np.argmin(np.where(half, left, np.inf)))
+        following = rival(left, k)
+        clear = float(left[k]) <= min(_MOST_LEFT, _APART * following)
+        if scaled and clear:
+            roughly = _left(seen, known, felt, _SCALE)[0]
+            least = float(roughly[max(k - _NEAR, 0) : k + _NEAR + 1].min())
+            clear = least <= _ROUGHLY_APART * rival(roughly, k)
         part = vertex(*left[k - 1 : k + 2].tolist()) if 0 < k < len(left) - 1 else 0.0
         lag_s = (k + part - (len(seen) - 1)) * _STEP_S
-        return lag_s + float(felt_s[0] - at[0]), float(left[k]), float(others.min())
+        return lag_s + float(felt_s[0] - at[0]), float(left[k]), following, clear
 
-    whole, left, following = offset(known)
-    if left > min(_MOST_LEFT, _APART * following):
+    whole, left, following, clear = offset(known)
+    if not clear:
         return None
     first = np.arange(len(at)) < len(at) // 2
     parts = (known & first, known & ~first)
     halves = [offset(part) for part in parts if part.sum() >= 10 * _OVER]
-    clear = len(halves) == 2 and all(one[1] <= min(_MOST_LEFT, _APART * one[2]) for one in halves)
-    return Clocks(whole, halves[1][0] - halves[0][0] if clear else None, left, following)
+    told = len(halves) == 2 and all(clear for *_, clear in halves)
+    drift_s = halves[1][0] - halves[0][0] if told else None
+    if drift_s is not None and abs(drift_s) > max(_DRIFT_S, _DRIFT * float(np.ptp(at)) / 2.0):
+        return None
+    return Clocks(whole, drift_s, left, following)

@@ -305,6 +305,11 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     for target, code, words_of in (("board.csv", 3, "is an input"), ("log.txt", 2, "")):
         ended = calib(*words, target, cwd=tmp_path)
         assert ended.code == code and words_of in ended.err
+    ended = calib(*words, "both.csv", "--offset", "1", cwd=tmp_path)
+    assert ended.code == 2 and "--offset: does not go with --same-clock" in ended.err
+    offset = ("join", "track.csv", "board.csv", "--offset=-8.99", "-o", "moved.csv")
+    assert calib(*offset, cwd=tmp_path).code == 0
+    assert "0.010000,5,6,,," in (tmp_path / "moved.csv").read_text()
     ended = calib("join", "track.csv", "board.csv", "-o", "other.csv", cwd=tmp_path)
     assert ended.code == 3 and "do not tell one offset" in ended.err
     assert not (tmp_path / "other.csv").exists()

@@ -110,6 +110,16 @@ def test_a_coordinate_that_lags_or_stands_is_not_ok(way: str) -> None:
     assert any(text.startswith("pictures contradict the IMU") for text in words) == (way != "good")
 
 
+def test_one_log_on_a_wrong_clock_is_named() -> None:
+    """Of all pictures hardly any is an outlier, of those of the swing a third."""
+    trial = known(SimulatedRig())
+    swing, slow = (align_log(twin_log(trial.rig, kind, more, 70)) for kind, more in MOTIONS[:2])
+    found = align([replace(swing, camera_s=swing.camera_s + 1.0), slow], prior_settings(trial.view))
+    named = [one for one in judge(found).findings if one.text.startswith(f"{swing.source}: ")]
+    assert [one.severity for one in named] == ["poor"] and "clock" in named[0].advice
+    assert sum(log.outliers for log in found.logs) < 0.1 * sum(log.pictures for log in found.logs)
+
+
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:
     nominal = SimulatedRig()
     tracker = replace(nominal.tracker, outliers=0.03, dropouts=0.05, blackouts_s=((1.0, 0.4),))
@@ -598,9 +608,9 @@ def test_two_logs_are_joined_by_the_motion_that_both_saw(
     rig = _rig_file() if with_plane else Rig()
     if not told:
         with pytest.raises(BadInputError, match=r"track\.csv: its motion and that of board\.csv"):
-            joined(camera, board, rig, "rig.yaml", False)
+            joined(camera, board, rig, "rig.yaml")
         return
-    log, found, outside = joined(camera, board, rig, "rig.yaml", False)
+    log, found, outside = joined(camera, board, rig, "rig.yaml")
     assert found is not None
     assert found.offset_s == pytest.approx(offset_s - RIG.tracker.latency_s, abs=5e-3)
     assert len(log) == len(camera) + len(board) - outside and outside < 5
@@ -612,12 +622,27 @@ def test_two_logs_are_joined_by_the_motion_that_both_saw(
         np.testing.assert_array_equal(log.columns[name][there], one.columns[name][first:])
 
 
+@pytest.mark.parametrize("with_plane", [True, False])
+def test_a_board_that_begins_within_the_swing_is_not_joined_a_period_off(with_plane: bool) -> None:
+    camera, board = _apart(twin_log(RIG, "swing", {}, 3), 1234.567)
+    rig = _rig_file() if with_plane else Rig()
+    late = board.t_s > 0.5
+    board = replace(
+        board, t_s=board.t_s[late], columns={name: one[late] for name, one in board.columns.items()},
+        lines=np.arange(int(late.sum())),
+    )  # fmt: skip
+    with pytest.raises(BadInputError, match="do not tell one offset"):
+        joined(camera, board, rig, "rig.yaml")
+    moved = joined(camera, board, rig, "rig.yaml", 1234.5)[0]
+    assert moved.sampled("u_px").size and moved.t_s[moved.sampled("u_px")][-1] == camera.t_s[-1] + 1234.5
+
+
 def test_logs_of_one_clock_are_merged_as_they_are() -> None:
     camera, board = _apart(twin_log(RIG, "static", {}, 3), 0.0)
-    log, found, outside = joined(camera, board, Rig(), "rig.yaml", True)
+    log, found, outside = joined(camera, board, Rig(), "rig.yaml", 0.0)
     assert found is None and outside <= 1
     assert set(camera.t_s[outside:]) <= set(log.t_s)
     with pytest.raises(BadInputError, match=r"board\.csv: has no pictures"):
-        joined(board, board, Rig(), "rig.yaml", True)
+        joined(board, board, Rig(), "rig.yaml", 0.0)
     with pytest.raises(BadInputError, match="none of its pictures is within the time"):
-        joined(replace(camera, t_s=camera.t_s + 1e6), board, Rig(), "rig.yaml", True)
+        joined(replace(camera, t_s=camera.t_s + 1e6), board, Rig(), "rig.yaml", 0.0)

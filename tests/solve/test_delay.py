@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.solve.delay import delay_of, moments, shares, vertex
+from calib.solve.delay import clocks, delay_of, moments, shares, vertex
 
 
 def _motion(t: np.ndarray) -> np.ndarray:
@@ -39,3 +39,31 @@ def test_a_line_in_time_and_the_scale_leave_nothing(scale: float, offset: float,
 def test_the_vertex_is_where_the_parabola_is_least(at: float, bend: float, least: float) -> None:
     assert vertex(*(bend * (k - at) ** 2 + least for k in (-1, 0, 1))) == pytest.approx(at, abs=1e-6)
     assert vertex(least, least, least) == 0.0
+
+
+def _swing(t: np.ndarray) -> np.ndarray:
+    """Let go at 0.3 s, with periods of 0.25 s of which each is 0.8 times the one before."""
+    after = np.maximum(t - 0.3, 0.0)
+    return 0.4 * np.exp(np.log(0.8) * after / 0.25) * np.cos(2.0 * np.pi * after / 0.25)
+
+
+@pytest.mark.parametrize(
+    ("scale", "seen_s", "felt_s", "drift", "told"),
+    [
+        (1.0, 0.1, 0.0, 0.0, True),
+        (1.0, 0.1, 0.0, 2e-4, True),
+        (1.0, 0.3, 0.75, 0.0, False),
+        (0.85, 0.35, 0.35, 0.0, False),
+    ],
+)
+def test_a_swing_is_not_taken_for_the_one_a_period_later(
+    scale: float, seen_s: float, felt_s: float, drift: float, told: bool
+) -> None:
+    rng = np.random.default_rng(2)
+    board, seen = np.arange(felt_s, 6.0, 0.01), np.arange(seen_s, 6.0, 1.0 / 60.0)
+    way = scale * _swing(seen) + 0.002 * rng.normal(size=len(seen))
+    rates = -(_swing(board + 1e-4) - _swing(board - 1e-4)) / 2e-4 + 0.005 * rng.normal(size=len(board))
+    found = clocks((1.0 + drift) * seen - 50.0, way, board, rates, True)
+    assert (found is not None) == told
+    if found is not None:
+        assert found.offset_s == pytest.approx(50.0, abs=3e-3)

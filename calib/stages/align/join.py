@@ -30,14 +30,14 @@ def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, 
 
 
 def joined(
-    camera: Log, board: Log, rig: Rig, rig_name: str, one_clock: bool
+    camera: Log, board: Log, rig: Rig, rig_name: str, offset_s: float | None = None
 ) -> tuple[Log, Clocks | None, int]:
     """The board's log with the camera's marker in it, how the clocks stand, and pictures that are left out.
 
     Parameters
     ----------
     rig : whose camera and plane, where it has them, make an angle of the marker.
-    one_clock : whether both logs have the same clock already.
+    offset_s : to be added to the pictures' times, where it is known.
 
     Raises `BadInputError` for logs without pictures or gyroscope, and for motion that tells no offset.
     """
@@ -48,16 +48,17 @@ def joined(
             raise BadInputError(
                 f"{log.source}: lasts {np.ptp(log.t_s):.0f} s, expected {_LONGEST_S:.0f} s at most"
             )
-    found, offset_s = None, 0.0
-    if not one_clock:
+    found = None
+    if offset_s is None:
         gyro = board.signals("gz_radps")
         camera_s, way, scaled = _way(camera, rig, rig_name)
         found = clocks(camera_s, way, gyro.t_s, gyro["gz_radps"], scaled)
         if found is None:
             raise BadInputError(
                 f"{camera.source}: its motion and that of {board.source} do not tell one offset of their "
-                "clocks, expected quick turns of different sizes at uneven times that both recorded, or with "
-                "camera and plane in rig.yaml a swing; where both have one clock say --same-clock"
+                "clocks, expected quick turns of different sizes at uneven times, or with camera and plane "
+                "in rig.yaml a swing, that both recorded from the beginning; where the offset is known say "
+                "--offset, where both have one clock --same-clock"
             )
         offset_s = found.offset_s
     rows = camera.sampled("u_px", "v_px")

@@ -1118,6 +1118,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
 _OFFSET_S = (1e-3, 1e-2)
 _REST_RAD = math.radians(0.1)
 _OUTLIERS = (0.2, 0.5)
+_FEW = 20
 _SHORT_S = 3.0
 _JITTER_PX = 1.5
 _REPEATS = 0.25
@@ -1142,6 +1143,15 @@ def _data(found: Alignment) -> Iterator[Finding]:
             "unidentifiable" if share > _OUTLIERS[1] else "poor",
             f"{100.0 * share:.0f} % of {pictures} pictures show something else than the marker",
         )
+    # One log on a wrong clock is few among many.
+    for log in found.logs if len(found.logs) > 1 else ():
+        if log.outliers > max(_OUTLIERS[0] * log.pictures, _FEW):
+            yield Finding(
+                "poor",
+                f"{log.name}: {100.0 * log.outliers / log.pictures:.0f} % of its {log.pictures} pictures do "
+                f"not fit the IMU, expected {100.0 * _OUTLIERS[0]:.0f} % at most",
+                f"check the clock of {log.name}, or the offset that joined it, and what its marker is",
+            )
     duration = sum(log.duration_s for log in found.logs)
     if duration < _SHORT_S:
         yield Finding(
