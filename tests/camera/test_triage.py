@@ -13,7 +13,7 @@ from sets import SIZES, SPOILS, Recipe, camera_of, sheared, take
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture, usual_size
 from calib.stages.camera.bundle import calibrate, covariance, refitted
-from calib.stages.camera.checks import evidence, overdispersion
+from calib.stages.camera.checks import drift, evidence, overdispersion
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Intrinsics, calibrate_camera
 from calib.stages.camera.model import Board, Camera, View, pack
@@ -72,6 +72,24 @@ def test_one_step_without_a_view_agrees_with_a_fit_without_it() -> None:
     assert np.argmax(asked.moved) == 3
     assert asked.chance[3] < 1e-6 < asked.chance[rest].min()
     assert asked.moved[3] == pytest.approx(np.max(np.abs(true) / asked.sigma), rel=0.1)
+
+
+def test_a_lens_that_warms_up_is_in_sigma() -> None:
+    """One percent of the focal length from the first picture to the last."""
+    z = []
+    for seed in range(5):
+        camera, rng, views = camera_of(), np.random.default_rng(seed), list[View]()
+        recipe = Recipe(0.03)
+        assert drift(calibrate(pack(take(rng, camera, 18, recipe=recipe)), SIZE, "radial2")) is None
+        for k in range(18):
+            focal_px = camera.fx_px * (0.995 + 0.01 * k / 17)
+            other = replace(camera, fx_px=focal_px, fy_px=focal_px)
+            views += take(rng, other, 1, recipe=recipe, prefix=f"{k:02d}")
+        found = calibrate_camera(views, SIZE, Choices())
+        sigma = found.covariance.sigma()["fx_px"]
+        assert sigma > 0.002 * camera.fx_px
+        z.append((found.calibration.camera.fx_px - camera.fx_px) / sigma)
+    assert np.abs(z).max() < 3.0
 
 
 @pytest.mark.parametrize("kind", SPOILS)

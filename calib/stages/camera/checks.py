@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -487,7 +488,7 @@ def overdispersion(found: Evidence) -> float:
 # deviation; the problem is close to linear in deformations that are small beside the distance.
 
 _CERTAIN = 4.0
-"""Standard deviations of a deformation beyond which it is there."""
+"""Standard deviations of a deformation, or of a change from view to view, beyond which it is there."""
 DEFORMATIONS = ("aspect", "shear", "bow_x", "bow_y", "twist")
 
 
@@ -573,6 +574,31 @@ def target_shape(calibration: Calibration) -> TargetShape | None:
         sigma=sigma[P:],
         displacement_m=np.tensordot(step[P:], basis, axes=(0, basis.ndim - 3)).swapaxes(-1, -2),
     )
+
+
+def drift(calibration: Calibration) -> FloatArray | None:
+    """RMS change (P,) of the intrinsics about their mean, where they run evenly from view to view; else None.
+
+    As of a lens that warms up, or one refocused by too little to tell two cameras apart. The target keeps one
+    shape, which is estimated along.
+    """
+    views, P = calibration.observations.views, len(calibration.free)
+    if views < _LEAST_IN_ALL:
+        return None
+    found = evidence(calibration, _basis(calibration)[0], DEFORMATIONS)
+    t = np.linspace(-1.0, 1.0, views)
+    late, later = np.einsum("n,ngh->gh", t, found.S)[:, :P], np.einsum("n,ngh->gh", t**2, found.S)[:P, :P]
+    S = np.block([[found.S.sum(axis=0), late], [late.T, later]])
+    b = np.concatenate([found.b.sum(axis=0), t @ found.b[:, :P]])
+    inverse = scaled_inverse(S, 1e-12)
+    whole = -inverse @ b
+    common, step = whole[:-P], whole[-P:]
+    moved = common + t[:, None] * np.concatenate([step, np.zeros(len(common) - P)])
+    # Scatter of the views about what they run along.
+    about = replace(found, b=found.b + np.einsum("ngh,nh->ng", found.S, moved))
+    left = max(calibration.squared_sum - float(gain(S, b)), 0.0) / max(calibration.degrees_of_freedom - P, 1)
+    sigma = np.sqrt(np.maximum(np.diag(inverse)[-P:], 0.0) * left) * overdispersion(about)
+    return step / math.sqrt(3.0) if bool(np.any(np.abs(step) > _CERTAIN * sigma)) else None
 
 
 # ----------------------------------------------------------------------

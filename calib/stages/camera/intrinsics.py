@@ -29,6 +29,7 @@ from calib.stages.camera.checks import (
     FAULTS,
     apart_px,
     best_of_starts,
+    drift,
     evidence,
     image_outline,
     lens_shape,
@@ -720,20 +721,22 @@ def _by_the_views(fit: Calibration) -> Covariance:
 
     Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
     noise of their corners would let them: two to three times as much on real pictures. A board that is not
-    as described moves the camera by as much as it would if the board's shape were estimated too.
+    as described moves the camera by as much as it would if the board's shape were estimated too, and one that
+    changes from view to view is another by as much.
     """
     try:
         inflation = overdispersion(evidence(fit, fit.basis))
         tells = fit.basis is None and fit.observations.views >= _TELL_SHAPE
-        shape = target_shape(fit) if tells else None
+        shape, ran = (target_shape(fit), drift(fit)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
-        inflation, shape = 1.0, None
+        inflation, shape, ran = 1.0, None, None
     known = covariance(fit, (inflation * fit.sigma_px) ** 2)
-    if shape is None or not shape.certain:
-        return known
-    joint, P = known.joint.copy(), len(shape.shift)
-    joint[:P, :P] += np.outer(shape.shift, shape.shift)
-    return replace(known, intrinsics=known.intrinsics + np.outer(shape.shift, shape.shift), joint=joint)
+    for shift in (None if shape is None or not shape.certain else shape.shift, ran):
+        if shift is not None:
+            joint, P = known.joint.copy(), len(shift)
+            joint[:P, :P] += np.outer(shift, shift)
+            known = replace(known, intrinsics=known.intrinsics + np.outer(shift, shift), joint=joint)
+    return known
 
 
 def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:
