@@ -559,6 +559,24 @@ def test_squares_that_are_not_square_are_noticed() -> None:
     assert any("proportions of the board" in reason for reason in plane.verdict.reasons)
 
 
+def test_sigma_holds_for_a_board_that_is_bent() -> None:
+    """A millimetre over twelve centimetres, as a sheet that is not glued: it leaves .1 px and moves .2 mm."""
+    board = Board(7, 5, 0.02)
+    x, y = (board.points_m() - np.array([0.06, 0.04])).T
+    z = []
+    for k in range(12):
+        R = rotation(np.array([0.4 * np.cos(k), 0.4 * np.sin(k), 0.1 * k]))
+        t = np.array([0.0, 0.0, 0.3])
+        bent = np.stack([x, y, 1e-3 * (1.0 - (x / 0.06) ** 2)], axis=1)
+        noise = np.random.default_rng(k).normal(0.0, 0.02, (35, 2))
+        flat = np.stack([x, y], axis=1)
+        view = View("a", flat, project(THESIS, bent @ R.T + t) + noise)
+        plane = calibrate_plane(THESIS, None, [view])
+        read = plane_map(THESIS, plane.R_CW, plane.t_CW_m, plane_pixels(THESIS, R, t, flat[[0, 17, 34]]))
+        z.append(1e3 * (read - flat[[0, 17, 34]]) / plane.sigma.calibration_mm.max(axis=0))
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
+
+
 @pytest.mark.parametrize(("stretch", "word"), [(1.0, "ok"), (1.001, "ok"), (1.005, "poor"), (0.99, "poor")])
 def test_a_stretch_of_the_board_counts_by_what_it_moves(stretch: float, word: str) -> None:
     """Corners known to a hundredth of a pixel: half a percent is a tenth of a pixel, and .2 mm."""

@@ -139,6 +139,9 @@ _MOVED_PX, _MOVED_PROBABILITY = 0.25, 1e-4
 """Pictures contradict each other when they differ visibly and not by chance."""
 _SCATTER_PROBABILITY = 0.01
 """Below this the scatter between pictures, rather than within them, sets the uncertainty."""
+_ALIKE, _NEIGHBOURS = 0.3, 1.1
+"""Correlation of residuals at neighbours that noise does not reach; what a neighbour is, over the least
+distance."""
 _SIGMA_SHARE = 0.02
 """The plane's own sigma as a share of the workspace's diagonal."""
 _FEW_FREEDOMS = 10
@@ -204,6 +207,25 @@ def compare_pictures(
     worst = max((fit for fit in fits if np.isfinite(fit.moved_px)), key=lambda fit: fit.moved_px)
     inflation = ratio if probability < _SCATTER_PROBABILITY else 1.0
     return tuple(fits), Comparison(probability, worst.moved_px, worst.name, max(inflation, 1.0))
+
+
+def _alike(views: Sequence[View], residuals_px: FloatArray) -> float:
+    """Factor on the pose's covariance for residuals (M, 2) that are alike at neighbouring corners.
+
+    A bent board or another lens leaves such, and counts as few corners: of a correlation r between neighbours
+    along both sides as 1 of ((1 + r) / (1 - r))^2, at least as many as the pose has unknowns.
+    """
+    products = squares = 0.0
+    ends = np.cumsum([len(view.pixels) for view in views])[:-1]
+    for view, own in zip(views, np.split(residuals_px, ends), strict=True):
+        apart = np.linalg.norm(view.target_m[:, None] - view.target_m, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        i, j = np.nonzero(apart < _NEIGHBOURS * apart.min())
+        products += float(np.mean((own[i] * own[j]).sum(axis=1)))
+        squares += float(np.mean((own**2).sum(axis=1)))
+    r = products / max(squares, 1e-300)
+    most = max(len(view.pixels) for view in views) / 6.0
+    return 1.0 if r < _ALIKE else max(1.0, min(((1.0 + r) / (1.0 - r)) ** 2, most))
 
 
 def _own_pose(camera: Camera, view: View) -> Pose | None:
@@ -446,7 +468,8 @@ def calibrate_plane(
     pixels = np.concatenate([view.pixels for view in views])
     pose = fit_pose(camera, world_m, pixels, _same_points(world_m))
     pictures, comparison = compare_pictures(camera, views, pose)
-    pose = replace(pose, covariance=pose.covariance * comparison.inflation)
+    inflation = max(comparison.inflation, _alike(views, pose.residuals_px))
+    pose = replace(pose, covariance=pose.covariance * inflation)
 
     box = workspace_m
     if box is None:
