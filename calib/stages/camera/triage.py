@@ -60,8 +60,9 @@ reach it in one set of fifty, half of the sets with a skew that the model lacks.
 _ROUNDS = 8
 _CHANCE = 1e-3
 """Probability of T_i by chance below which a view is odd."""
-_ODD_NOISE = 3.0
-"""Noise of a view over a typical view's above which it is odd."""
+_ODD_NOISE, _ODD_NOISE_PX = 3.0, 0.03
+"""Noise of a view over a typical view's above which it is odd, and in pixels at up to 1000 pixels' width:
+corners of a small or steep board are less sure than those of a large one, in pictures without a flaw."""
 _MOVED_SIGMAS = 1.0
 _MOVED_PX = 0.02
 """A view matters that moves a parameter, and a direction in the picture, by more than this; pixels at up to
@@ -105,7 +106,8 @@ class Agreement:
 
     def leaving(self, scale: float) -> BoolArray:
         """Views that are odd, and matter, in a picture with this `scale_of`."""
-        odd = (self.chance < _CHANCE) | (self.noise > _ODD_NOISE)
+        noisy = (self.noise > _ODD_NOISE) & (self.noise_px > _ODD_NOISE_PX * scale)
+        odd = (self.chance < _CHANCE) | noisy
         moves = (self.moved > _MOVED_SIGMAS) & (self.moved_px > _MOVED_PX * scale)
         misfits = (self.misfit > Limits.view_bad) & (self.rms_px > Limits.point_floor_px)
         return np.asarray(odd & moves | misfits)
