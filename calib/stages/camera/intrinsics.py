@@ -27,6 +27,7 @@ from calib.stages.camera.bundle import (
 )
 from calib.stages.camera.checks import (
     FAULTS,
+    TargetShape,
     apart_px,
     best_of_starts,
     drift,
@@ -553,7 +554,7 @@ def calibrate_camera(
     unusable += copies
     sorted_out, models = _sorted_out(everything, image_size_px, choices)
     of_all = sorted_out.everything
-    turned = turned_views(_flattened(of_all) or of_all)
+    turned = turned_views(_on_its_board(of_all))
     by_name = {one.name for one in turned}
     if turned and not choices.keep_all:
         everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
@@ -624,17 +625,23 @@ def without_copies(
     return observations.select(sorted(own.values())), copies
 
 
-def _flattened(fit: Calibration) -> Calibration | None:
-    """The fit to a board of the shape that all views tell, None where they tell none.
+def _shape(fit: Calibration) -> TargetShape | None:
+    """The board's shape where it is certainly another than the one described."""
+    try:
+        shape = target_shape(fit) if np.all(np.isfinite(fit.normal)) else None
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return shape if shape is not None and shape.certain else None
+
+
+def _on_its_board(fit: Calibration) -> Calibration:
+    """The fit to a board of the shape that all views tell, or the same.
 
     A bow or a stretch moves the principal point of a view with its tilt, as another camera or a picture that
     was turned does.
     """
-    shape = target_shape(fit) if np.all(np.isfinite(fit.normal)) else None
-    if shape is None or not shape.certain:
-        return None
-    flat = straightened(fit, shape.displacement_m)
-    return None if flat is fit else flat
+    shape = _shape(fit)
+    return fit if shape is None else straightened(fit, shape.displacement_m)
 
 
 def _screened(fit: Calibration) -> Triage:
@@ -642,12 +649,10 @@ def _screened(fit: Calibration) -> Triage:
     found = triage(fit)
     everything, gone = fit.observations, {one.name for one in found.left_out if one.kind == "view"}
     for source in (fit, found.calibration) if gone else ():
-        shape = target_shape(source)
-        if shape is None or not shape.certain:
-            continue
-        other = triage(straightened(fit, shape.displacement_m))
-        leaving = {one.name for one in other.left_out if one.kind == "view"}
-        if len(leaving) >= len(gone):
+        shape = _shape(source)
+        other = None if shape is None else triage(straightened(fit, shape.displacement_m))
+        leaving = {one.name for one in other.left_out if one.kind == "view"} if other else gone
+        if other is None or len(leaving) >= len(gone):
             continue
         kept = np.flatnonzero(~np.isin(everything.names, list(leaving)))
         some = everything.select(kept)
@@ -727,11 +732,11 @@ def _by_the_views(fit: Calibration) -> Covariance:
     try:
         inflation = overdispersion(evidence(fit, fit.basis))
         tells = fit.basis is None and fit.observations.views >= _TELL_SHAPE
-        shape, ran = (target_shape(fit), drift(fit)) if tells else (None, None)
+        shape, ran = (_shape(fit), drift(fit)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
         inflation, shape, ran = 1.0, None, None
     known = covariance(fit, (inflation * fit.sigma_px) ** 2)
-    for shift in (None if shape is None or not shape.certain else shape.shift, ran):
+    for shift in (None if shape is None else shape.shift, ran):
         if shift is not None:
             joint, P = known.joint.copy(), len(shift)
             joint[:P, :P] += np.outer(shift, shift)
