@@ -204,6 +204,9 @@ def test_a_command_that_nobody_knows_and_a_place_that_jumps_are_told() -> None:
     columns["tip_y_m"] = columns["tip_y_m"] + 0.02 * (trial.t_s > 30.0)
     said = _said(columns, trial)
     assert "poor: a: has no command from 18.0 to 22.0 s, which a free run needs" in said
+    changes = np.diff(trial.command, prepend=np.nan) != 0.0
+    sparse = columns_of(trial) | {"p_cmd1_kpa": np.where(changes, trial.command, np.nan)}
+    assert "has no command" not in _said(sparse, trial)
     assert "line 1503: motion capture jumps by 20" in said
 
 

@@ -208,7 +208,9 @@ def _unknown(recording: Recording) -> Iterator[Finding]:
     for name, values in (("command", recording.command), ("pressure", recording.pressure)):
         if values is None or not np.isfinite(values).any():
             continue
-        at = t[np.isfinite(values)]
+        there = np.isfinite(values)
+        # What is logged where it changes, as a command, is known between.
+        at = t[there] if there.mean() > 0.5 else t
         long = np.flatnonzero(np.diff(at) > _UNKNOWN_S)
         if len(long):
             first, last = at[long[0] : long[0] + 2] - t[0]
