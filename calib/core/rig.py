@@ -339,6 +339,11 @@ class Rig:
         return x0, y0, x1, y1
 
     @property
+    def marker_offset_m(self) -> float:
+        """Marker beyond the head along its tangent (A.1), as drawn."""
+        return (self.geometry or Geometry()).marker_offset_m
+
+    @property
     def middle_m(self) -> tuple[float, float]:
         """The middle of the workspace, about which an alignment's stretch magnifies."""
         x0, y0, x1, y1 = self.workspace_m

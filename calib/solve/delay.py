@@ -48,16 +48,19 @@ def moments(
     return sums
 
 
-def shares(sums: FloatArray, scaled: bool) -> tuple[FloatArray, FloatArray]:
+def shares(sums: FloatArray, most: float = np.inf, least: float = 0.5) -> tuple[FloatArray, FloatArray]:
     """Factors a (k,) and the shares of the late one's squares that are left (k,), of sums (k, 3).
 
     Parameters
     ----------
-    scaled : whether both have one scale; else a is the best one.
+    most : factor in size between both, or its reciprocal, at most; 1 for one scale, infinite for
+        any of either sign.
+    least : share of the late one's motion below which a delay explains none.
     """
     cross, own, total = sums.T
-    a = np.ones(len(sums)) if scaled else np.divide(cross, own, out=np.zeros(len(sums)), where=own > 0.0)
-    seen = total > max(0.5 * float(total.max(initial=0.0)), 0.0)
+    a = np.divide(cross, own, out=np.zeros(len(sums)), where=own > 0.0)
+    a = np.clip(a, 1.0 / most, most) if most < np.inf else a
+    seen = total > max(least * float(total.max(initial=0.0)), 0.0)
     explained = np.divide(a * (2.0 * cross - a * own), total, out=np.zeros(len(sums)), where=seen)
     return a, np.maximum(1.0 - explained, 0.0)
 
@@ -80,7 +83,7 @@ _CLEAR = 0.25
 def _about(late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:
     """The delay [s], to 5 ms, that leaves the least; 0 where that is a usual one, or leaves hardly less."""
     # Of a swing a period early the rest has the same shape and is larger.
-    left = shares(moments(late_s, late_rad, t_s, turned_rad, _LONG_S, _FEWEST), True)[1]
+    left = shares(moments(late_s, late_rad, t_s, turned_rad, _LONG_S, _FEWEST), 1.0)[1]
     k, usual = int(np.argmin(left)), float(left[: int(np.searchsorted(_LONG_S, _USUAL_S[-1]))].min())
     return float(_LONG_S[k]) if left[k] < min(_CLEAR, 0.5 * usual) else 0.0
 
@@ -166,11 +169,7 @@ def _on_grid(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
 def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, most: float) -> tuple[FloatArray, BoolArray]:
     """left (n,) at the delays 1 - len(seen) .. len(felt) - 1 of grids, and where half is shared.
 
-    Where too little is shared to say anything, all is left.
-
-    Parameters
-    ----------
-    most : factor in size between the records, or its reciprocal, at most; infinite for one of either sign.
+    Where too little is shared to say anything, all is left. `most` as in `shares`.
     """
     seen = np.where(known, seen - seen[known].mean(), 0.0)
     there, rows = np.ones(len(felt)), known.astype(np.float64)
@@ -180,11 +179,10 @@ def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, most: float) -> 
     counts = (np.maximum(part, own_part) > _RIVAL) & (shared * _STEP_S > _RIVAL_S)
     # Sums of nothing are rounding errors, of which any share is explained.
     counts &= np.minimum(part, own_part) > _NOTHING
-    a = np.divide(cross, own, out=np.zeros(len(own)), where=counts)
-    a = np.clip(a, 1.0 / most, most) if most < np.inf else a
-    explained = np.divide(a * (2.0 * cross - a * own), total, out=np.zeros(len(own)), where=counts)
+    sums = np.stack([cross, own, total], axis=1)
+    sums[~counts] = 0.0
     half = counts & (part > 0.5) & (shared > 0.5 * float(rows.sum()))
-    return np.clip(1.0 - explained, 0.0, 1.0), half
+    return np.minimum(shares(sums, most, least=0.0)[1], 1.0), half
 
 
 def clocks(

@@ -26,13 +26,13 @@ def test_a_line_in_time_and_the_scale_leave_nothing(scale: float, offset: float,
     t, seen = 0.01 * np.arange(1000), np.arange(0.0, 10.0, 0.02)
     late = scale * _motion(seen) + offset + slope * seen
     sums = moments(seen, late, t, _motion(t), np.array([0.0, 20.0]), 20)
-    a, left = shares(sums, scaled=False)
+    a, left = shares(sums)
     moved = np.linalg.norm(scale * _motion(seen)) > 1e-6
     assert a[0] == pytest.approx(scale, abs=1e-9)
     # No motion, and a delay at which nothing is shared, leave all.
     assert left == pytest.approx([0.0 if moved else 1.0, 1.0], abs=1e-6 if moved else 1.0)
     if moved:
-        assert shares(sums, scaled=True)[1][0] == pytest.approx((1.0 / scale - 1.0) ** 2, rel=1e-6, abs=1e-6)
+        assert shares(sums, 1.0)[1][0] == pytest.approx((1.0 / scale - 1.0) ** 2, rel=1e-6, abs=1e-6)
 
 
 @given(st.floats(-0.5, 0.5), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))

@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.rig import Geometry, Rig
+from calib.core.rig import Rig
 from calib.io.logs import Log
 from calib.solve.delay import Clocks, clocks
 from calib.stages.actuator.kinematics import angle_from_marker
@@ -24,7 +24,7 @@ def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, 
         moved = pictures.values - pictures.values.mean(axis=0)
         return pictures.t_s, moved @ np.linalg.svd(moved, full_matrices=False)[2][0], False
     marker = plane.to_world(pictures.values, rig.camera)
-    phi = angle_from_marker(marker, (rig.geometry or Geometry()).marker_offset_m)
+    phi = angle_from_marker(marker, rig.marker_offset_m)
     fine = np.isfinite(phi)
     return pictures.t_s[fine], phi[fine], True
 

@@ -535,7 +535,7 @@ def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     `sums` (n, 3) are its moments at some offsets. Half a period late a swing turns the other way round: it
     counts as turned where no offset of the other sign explains it half as well.
     """
-    factors, left = shares(sums, scaled=False)
+    factors, left = shares(sums)
     total = float(sums[:, 2].max())
     least = {sign: float(np.min(left[sign * factors > 0.0], initial=1.0)) for sign in (1.0, -1.0)}
     turned = least[-1.0] < 0.5 * least[1.0]
@@ -727,7 +727,7 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
     for log, own in zip(logs, by_log, strict=True):
         _check_gyro(log, own)
     sums = by_log.sum(axis=0)
-    factors, left = shares(sums, scaled=False)
+    factors, left = shares(sums)
     usual = int(np.argmin(np.abs(OFFSETS_S - usual_offset_s)))
     best = int(np.argmin(left))
     moves = bool((left.max() - left[best]) * sums[best, 2] / _PHI_SIGMA**2 > _WORTH)

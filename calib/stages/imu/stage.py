@@ -166,7 +166,6 @@ class TuneOptions(LogOptions):
 
 
 def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
-    from calib.core.rig import Geometry
     from calib.io.logs import read_log
     from calib.stages.actuator.kinematics import angle_from_marker
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
@@ -178,9 +177,9 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     if options.reference in ("auto", "camera"):
         plane = rig.current_plane(files.rig_path)
     if camera is not None and plane is not None:
-        offset_m = (rig.geometry or Geometry()).marker_offset_m
         how = replace(
-            how, angle_seen=lambda pixels: angle_from_marker(plane.to_world(pixels, camera), offset_m)
+            how,
+            angle_seen=lambda pixels: angle_from_marker(plane.to_world(pixels, camera), rig.marker_offset_m),
         )
     logs: list[TuneLog] = []
     for path in files.paths:
