@@ -220,7 +220,7 @@ class PlaneInputs:
     views: Sequence[model.View]
     workspace_m: tuple[float, float, float, float]
     orientation: tuple[str, ...]
-    doubts: tuple[str, ...]
+    doubt: str
     left_out: tuple[LeftOut, ...]
     simulated: bool
 
@@ -266,7 +266,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
             stated.dictionary,
         )
     world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
-    views, orientation, doubts = [], [], list[str]()
+    views, orientation, doubt = [], [], ""
     for view in search.views:
         pixels, kept, how = view.pixels, view.measured, "The board's markers say which corner is (0, 0)."
         assert kept is not None
@@ -275,7 +275,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
                 pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
             )
             pixels, kept, how = placed.pixels, placed.reordered(kept, search.board), placed.how
-            doubts += [placed.doubt] * bool(placed.doubt)
+            doubt = doubt or placed.doubt
         views.append(View(view.name, world_m[kept], pixels[kept]))
         orientation.append(f"{view.name}: {how}")
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
@@ -284,7 +284,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         views,
         rig.workspace_m,
         tuple(orientation),
-        tuple(doubts),
+        doubt,
         search.left_out,
         stated.simulated,
     )
@@ -307,10 +307,10 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         workspace_m=inputs.workspace_m,
         camera_rms_px=inputs.camera.rms_px,
     )
-    doubts = [
-        Finding("poor", one, "state which it is with first_corner_px: [u, v] in board.yaml")
-        for one in inputs.doubts[:1]
-    ]
+    findings = [*fit.verdict.findings]
+    if inputs.doubt:
+        advice = "state which it is with first_corner_px: [u, v] in board.yaml"
+        findings.append(Finding("poor", inputs.doubt, advice))
     sigma = np.sqrt(np.diag(fit.covariance))
     names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
     parts = ("intrinsics", "plane", "calibration", "quantisation", "total")
@@ -342,7 +342,7 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         points=len(fit.corners_m),
         orientation=" ".join(inputs.orientation),
         simulated=inputs.simulated,
-        **judged(Verdict.of([*fit.verdict.findings, *doubts])),
+        **judged(Verdict.of(findings)),
     ).with_evidence(PlaneEvidence(optics, fit, inputs.left_out))
 
 

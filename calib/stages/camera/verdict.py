@@ -635,14 +635,14 @@ def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[
     """Squares that are square, on a board that is flat."""
     if found is None:
         return
-    off = abs(found.aspect)
+    off, allowed = abs(found.aspect), "; sigma allows for it" if found.certain else ""
     squares = (
         f"the board's squares are {1 + found.aspect:.3f} times as high as wide "
         f"(standard deviation {found.aspect_sigma:.3f})"
     )
     pixel = abs(calibration.camera.fx_px / calibration.camera.fy_px - 1.0)
     if off > Limits.aspect_remark and off > Limits.aspect_sigma * found.aspect_sigma:
-        text = f"{squares[0].upper()}{squares[1:]}, not square as said; sigma allows for it."
+        text = f"{squares[0].upper()}{squares[1:]}, not square as said{allowed}."
         advice = "Measure the printed squares along both sides; print without scaling."
         yield Finding("inconsistent" if off > Limits.aspect_bad else "remark", text, advice)
     elif pixel > Limits.pixel_aspect:
@@ -661,8 +661,8 @@ def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[
         text = (
             f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
             f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
-            f"{100 * Limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %; "
-            "sigma allows for it."
+            f"{100 * Limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %"
+            f"{allowed}."
         )
         kind: Severity = (
             "inconsistent" if bend > Limits.bow_bad else "poor" if moved > Limits.bow_focal else "remark"
