@@ -237,10 +237,18 @@ def test_an_arm_that_bends_to_negative_angles_is_the_same_arm() -> None:
     again = trial_of(recording, frame, "a", 0.0)
     np.testing.assert_allclose(again.angle_rad, trial.angle_rad[: len(again.angle_rad)], atol=2e-3)
     np.testing.assert_allclose(again.chord_m, trial.chord_m[: len(again.chord_m)], atol=2e-4)
-    right = recording_of(_log(columns_of(trial, planar=True), trial), "a")
+    # Beside poses that turn about some axis of their own it is the same arm too.
+    poses = recording_of(_log(columns_of(trial), trial), "b")
+    both = trial_of(recording, frame_of([poses, recording]), "a", 0.0)
+    np.testing.assert_allclose(both.angle_rad, again.angle_rad)
+
+
+def test_poses_about_another_axis_than_the_arms_are_refused() -> None:
+    trial = simulated("a", 1)
+    right, conjugated = (recording_of(_log(columns_of(trial, one), trial), "a") for one in (False, True))
+    check_frame([right], frame_of([right]))
     with pytest.raises(BadInputError, match="turns about an axis 180 deg from that of the arm"):
-        check_frame([right], frame)
-    check_frame([recording], frame)
+        check_frame([conjugated], frame_of([right]))
 
 
 def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:

@@ -49,7 +49,8 @@ class Frame:
 
     Attributes
     ----------
-    axis : (3,) of the bending, in the frame of the base; along z for poses in the plane, None without poses.
+    axis : (3,) of the bending, in the frame of the base; None for poses in the plane.
+    grows : sign with which the angles of poses in the plane grow with bending.
     conjugated : whether quaternions map the world to the body.
     leans : turn of the chord over that of the tip.
     planar_deg : angle between the axis and the normal of the tip's path.
@@ -57,6 +58,7 @@ class Frame:
     """
 
     axis: FloatArray | None
+    grows: float = 1.0
     conjugated: bool = False
     leans: float = math.nan
     planar_deg: float = math.nan
@@ -281,8 +283,7 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
         (one.turned, one.chord) for one in recordings if one.turned is not None and one.chord is not None
     ]
     if not with_poses:
-        angles = [one.planar[:, 0] for one in recordings if one.planar is not None]
-        return Frame(np.array([0.0, 0.0, _grows(np.concatenate(angles))]) if angles else None)
+        return Frame(None, planar_sign(recordings))
     turned, chord = (np.concatenate(parts) for parts in zip(*with_poses, strict=True))
     seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
     turned, chord = turned[seen], chord[seen]
@@ -310,7 +311,14 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
     straight = first * math.cos(offset) + side * math.sin(offset)
     # The angle grows with bending, whatever way that is.
     axis = _grows(angle) * axis
-    return Frame(axis, conjugated, abs(float(leans)), planar, straight / np.linalg.norm(straight))
+    return Frame(
+        axis,
+        planar_sign(recordings),
+        conjugated,
+        abs(float(leans)),
+        planar,
+        straight / np.linalg.norm(straight),
+    )
 
 
 def _grows(angle_rad: FloatArray) -> float:
@@ -319,11 +327,16 @@ def _grows(angle_rad: FloatArray) -> float:
     return -1.0 if -low > high else 1.0
 
 
+def planar_sign(recordings: Sequence[Recording]) -> float:
+    """The sign with which the angles of poses in the plane grow with bending; 1 without any."""
+    angles = [one.planar[:, 0] for one in recordings if one.planar is not None]
+    return _grows(np.concatenate(angles)) if angles else 1.0
+
+
 def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
     """Raise `BadInputError` for poses that turn about another axis than that of an identified arm."""
     for one in recordings:
-        poses = one.turned if one.planar is None else one.planar[:, :1]
-        if frame.axis is None or poses is None or _range(poses) < 4.0 * _LEAST_TURN_RAD:
+        if frame.axis is None or one.turned is None or _range(one.turned) < 4.0 * _LEAST_TURN_RAD:
             continue
         axis = frame_of([one]).axis
         off = 0.0 if axis is None else math.acos(min(max(float(axis @ frame.axis), -1.0), 1.0))
@@ -331,13 +344,13 @@ def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
             raise BadInputError(
                 f"{one.source}: its tip turns about an axis {math.degrees(off):.0f} deg from that of the arm "
                 "in the rig's file, expected the same arm and motion capture: look at the quaternions' order "
-                "and convention, and at the sign of an angle"
+                "and convention"
             )
 
 
 def frame_findings(frame: Frame) -> Iterator[Finding]:
     """What the poses show of the arm and of the motion capture, in sentences."""
-    if frame.axis is not None and frame.direction is None and frame.axis[2] < 0.0:
+    if frame.grows < 0.0:
         yield Finding(
             "remark", "tip_phi_rad falls as the arm bends; the angle is counted as it grows with bending"
         )
@@ -385,7 +398,7 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
         unseen = _gaps(grid, t, recording.turned)
     elif recording.planar is not None:
         angle, chord = (_between(grid, t, column) for column in recording.planar.T)
-        angle = angle if frame.axis is None else frame.axis[2] * angle
+        angle = frame.grows * angle
         unseen = _gaps(grid, t, recording.planar)
     command = none if recording.command is None else _means(grid, t, recording.command)
     if not len(pressure) and not len(angle):

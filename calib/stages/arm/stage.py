@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
@@ -91,7 +91,14 @@ def read_trials(
     """
     from calib.core.units import parse_mass_kg
     from calib.io.logs import read_log
-    from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
+    from calib.stages.arm.read import (
+        check_frame,
+        frame_findings,
+        frame_of,
+        planar_sign,
+        recording_of,
+        trial_of,
+    )
 
     names = [path.stem for path in files.paths]
     if len(set(names)) < len(names):
@@ -109,9 +116,11 @@ def read_trials(
                 f"{name}: is the same recording as {seen[digest]}, expected another trial; leave one out"
             )
         seen[digest] = name
-    if frame is not None:
+    if frame is None:
+        found = frame_of(recordings)
+    else:
         check_frame(recordings, frame)
-    found = frame_of(recordings) if frame is None else frame
+        found = replace(frame, grows=planar_sign(recordings))
     trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
     loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items()) or "none"
     files.remarks.append(f"days: {', '.join(sorted(set(days.values())))}; loads: {loaded}")
