@@ -13,7 +13,7 @@ from calib.core.errors import BadInputError
 from calib.io.pictures import list_pictures, read_picture
 from calib.stages.camera.corners import detect, find_size
 from calib.stages.camera.read import find_boards
-from calib.stages.camera.targets import detect_charuco, find_markers, recognise
+from calib.stages.camera.targets import circle_grid, detect_charuco, find_markers, recognise
 
 BOARDS = {
     "usual": (charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75), 0.7),
@@ -141,3 +141,15 @@ def test_other_targets_are_named(drawing: Drawing, says: str, tmp_path: Path) ->
         cv2.imwrite(str(tmp_path / f"{seed}.png"), render(drawing, *pose(drawing, seed, 0.7, 0.1)))
     with pytest.raises(BadInputError, match=says):
         find_boards(list_pictures([tmp_path]), None, 1.0)
+
+
+def test_round_spots_in_no_grid_are_not_tried_as_one(monkeypatch) -> None:
+    rng = np.random.default_rng(4)
+    gravel = np.full((480, 640), 60, dtype=np.uint8)
+    for centre in rng.integers(0, [640, 480], (400, 2)):
+        cv2.circle(gravel, centre.tolist(), int(rng.integers(6, 12)), int(rng.integers(120, 255)), -1)
+    tried: list[object] = []
+    monkeypatch.setattr(cv2, "findCirclesGrid", lambda *a, **k: tried.append(a) or (False, None))
+    assert circle_grid(cv2.GaussianBlur(gravel, (0, 0), 1)) is None
+    # At this many round spots OpenCV takes half a second for each size that it is asked for.
+    assert len(tried) <= 1

@@ -441,29 +441,95 @@ _CIRCLES = (12, 300)
 """Round spots of a picture that may show a grid of circles."""
 _ROUND = 0.83
 """4 pi area / perimeter^2: of a square pi / 4, of a circle seen at 60 degrees 0.84."""
-_MOST_SPOTS = 1.3
-"""Round spots over the circles of the grid."""
+_AROUND = 8
+"""Nearest spots, of which those on opposite sides are a spot's neighbours in its row and column."""
+_BESIDE = 0.3
+"""Distance of a spot from its place over that of its neighbour: perspective takes a tenth of it."""
+_BASES = tuple(np.array(basis) for basis in ([[1, 0], [0, 1]], [[1, 1], [0, 1]], [[1, -1], [0, 1]]))
+"""What two neighbours may be in columns and rows, where slanting ones are the nearer."""
+
+
+def _neighbours(points: FloatArray) -> FloatArray:
+    """Steps (N, 2, 2) to the next spot of a row and to that of a column; NaN where opposite spots lack."""
+    apart = points[None] - points[:, None]
+    order = np.argsort(np.hypot(*apart.transpose(2, 0, 1)), axis=1)[:, 1 : _AROUND + 1]
+    v = np.take_along_axis(apart, order[..., None], axis=1)
+    i, j = np.triu_indices(v.shape[1], 1)
+    opposed = np.linalg.norm(v[:, i] + v[:, j], axis=2) < _BESIDE * np.linalg.norm(v[:, i], axis=2)
+    steps = np.full((len(points), 2, 2), np.nan)
+    for at, (paired, found) in enumerate(zip(v[:, i], opposed, strict=True)):
+        pairs = paired[found]
+        if len(pairs) == 0:
+            continue
+        a, lengths = pairs[0], np.linalg.norm(pairs, axis=1)
+        across = np.abs(a[0] * pairs[:, 1] - a[1] * pairs[:, 0]) > 0.5 * lengths[0] * lengths
+        if across.any():
+            steps[at] = a, pairs[np.argmax(across)]
+    return steps
+
+
+def _places(points: FloatArray) -> IntArray:
+    """Whole coordinates (n, 2) of the spots of the largest grid among those at `points` (N, 2)."""
+    steps = _neighbours(points)
+    inner = np.isfinite(steps[:, 0, 0])
+    left, largest = set(np.flatnonzero(inner).tolist()), np.zeros((0, 2), dtype=np.int64)
+    while left:
+        first = min(left)
+        places, waiting = {first: (0, 0)}, [(first, steps[first])]
+        while waiting:
+            at, basis = waiting.pop(0)
+            for side in (*np.eye(2), *-np.eye(2)):
+                step = side @ basis
+                gap = np.linalg.norm(points - points[at] - step, axis=1)
+                there = int(np.argmin(gap))
+                if there in places or gap[there] > _BESIDE * np.linalg.norm(step):
+                    continue
+                places[there] = (places[at][0] + int(side[0]), places[at][1] + int(side[1]))
+                waiting.append((there, _like(basis, steps[there]) if inner[there] else basis))
+        left -= places.keys()
+        if len(places) > len(largest):
+            largest = np.array(list(places.values()))
+    return largest
+
+
+def _like(basis: FloatArray, steps: FloatArray) -> FloatArray:
+    """The steps, or what they make together, that are nearest to a neighbour's basis (2, 2)."""
+    near = np.concatenate([steps, -steps])
+    chosen = near[np.argmin(np.linalg.norm(near[None] - basis[:, None], axis=2), axis=1)]
+    off = np.linalg.norm(chosen - basis, axis=1) > _BESIDE * np.linalg.norm(basis, axis=1)
+    return np.where(off[:, None], basis, chosen)
+
+
+def _sizes(places: IntArray) -> list[tuple[str, int, int]]:
+    """Grids that spots at these coordinates fill: kind, circles in a row, rows."""
+    sizes, count = [], len(np.unique(places, axis=0))
+    for basis in _BASES if count >= _CIRCLES[0] else ():
+        straight = places @ basis
+        columns, rows = sorted(np.ptp(straight, axis=0) + 1, reverse=True)
+        if count == columns * rows:
+            sizes.append(("symmetric", int(columns), int(rows)))
+        across, along = np.ptp(straight @ [[1, 1], [1, -1]], axis=0) + 1
+        for wide, rows in ((across, along), (along, across)):
+            if wide % 2 == 0 and 2 * count == wide * rows:
+                sizes.append(("asymmetric", int(wide // 2), int(rows)))
+    return [(kind, columns, rows) for kind, columns, rows in sizes if min(columns, rows) >= 3]
 
 
 def circle_grid(gray: GrayImage) -> tuple[str, int, int] | None:
-    """What grid of circles OpenCV finds: "symmetric" or "asymmetric", circles in a row, and rows."""
+    """What grid of circles a picture shows: "symmetric" or "asymmetric", circles in a row, and rows.
+
+    The spots say the size that OpenCV is asked for. To ask for every size took a minute for each picture
+    of gravel.
+    """
     small = _reduced(gray, _CIRCLES_PIXELS)
     parameters = cv2.SimpleBlobDetector.Params()
     parameters.filterByCircularity, parameters.minCircularity = True, _ROUND
     spots = cv2.SimpleBlobDetector.create(parameters)
     for image in (small, cv2.bitwise_not(small)):
-        count = len(spots.detect(image))
-        if not _CIRCLES[0] <= count <= _CIRCLES[1]:
+        points = np.array([spot.pt for spot in spots.detect(image)]).reshape(-1, 2)
+        if not _CIRCLES[0] <= len(points) <= _CIRCLES[1]:
             continue
-        sizes = [
-            (columns, rows, kind)
-            for columns in range(3, 30)
-            for rows in range(3, 30)
-            for kind in ("symmetric", "asymmetric")
-            if columns * rows <= count <= _MOST_SPOTS * columns * rows
-            and (columns >= rows if kind == "symmetric" else rows <= 4 * columns)
-        ]
-        for columns, rows, kind in sorted(sizes, key=lambda size: -size[0] * size[1]):
+        for kind, columns, rows in _sizes(_places(points)):
             flag = cv2.CALIB_CB_SYMMETRIC_GRID if kind == "symmetric" else cv2.CALIB_CB_ASYMMETRIC_GRID
             if cv2.findCirclesGrid(image, (columns, rows), flags=flag, blobDetector=spots)[0]:
                 return kind, columns, rows
