@@ -118,7 +118,7 @@ VARIANTS: dict[str, Callable[[GrayImage], GrayImage]] = {
 @pytest.mark.parametrize(
     ("folder", "size", "variant"),
     [
-        ("gloworm_qvga", (8, 6), "sharpened 1 px"),
+        pytest.param("gloworm_qvga", (8, 6), "sharpened 1 px", marks=pytest.mark.slow),
         ("gloworm_qvga", (8, 6), "sharpened 3 px"),
         ("opencv_left", (9, 6), "two tones"),
         ("opencv_left", (9, 6), "overexposed"),
@@ -424,7 +424,7 @@ def _spots(radius: float, square_px: float, blur_px: float, dark: bool, shape: s
     return picture if dark else 255 - picture
 
 
-@pytest.mark.parametrize("square_px", [8, 11])
+@pytest.mark.parametrize("square_px", [8, pytest.param(11, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
 def test_grids_of_round_spots_are_no_boards(square_px: float, blur_px: float) -> None:
     """Spots that nearly touch look like corners of a board; what tells them is that their edges bulge."""

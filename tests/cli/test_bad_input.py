@@ -143,7 +143,7 @@ def test_a_picture_of_one_pixel_and_pictures_without_a_board(calib, pictures, no
     assert ended.sentence == "one.png: no checkerboard found in the picture"
     (folder / "one.png").unlink()
     for name in ("a.png", "b.png"):
-        (folder / name).write_bytes(_encoded(".png", noise(64, 48)))
+        (folder / name).write_bytes(_encoded(".png", noise(24, 18)))
     ended = calib("intrinsics", folder, "--corners", "7x5", "--rig", rig)
     assert ended.code == 3
     assert "no board with 7x5 inner corners found in any of 2 pictures, and no other" in ended.sentence

@@ -55,6 +55,7 @@ def session() -> Session:
 # The session.
 
 
+@pytest.mark.slow
 def test_from_the_first_frame_to_enough() -> None:
     """A person who follows the outline gets a camera that is ok and within its sigmas of the true one."""
     live = session()
