@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armtrials import SCALE, TRUE, columns_of, simulated
+from scipy.spatial.transform import Rotation
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
@@ -130,16 +131,32 @@ def _log(columns: dict[str, FloatArray], trial: Trial) -> Log:
     return Log("a.csv", trial.t_s, columns, np.arange(len(trial.t_s)) + 2)
 
 
+def _turned(columns: dict[str, FloatArray], turn: Rotation, conjugated: bool) -> dict[str, FloatArray]:
+    """The same arm in a world whose axes are others."""
+    out = dict(columns)
+    for of in ("base", "tip"):
+        place = turn.apply(np.stack([columns[f"{of}_{k}_m"] for k in "xyz"], axis=1))
+        read = Rotation.from_quat(np.stack([columns[f"{of}_q{k}"] for k in "xyzw"], axis=1))
+        read = read * turn.inv() if conjugated else turn * read
+        out |= {f"{of}_{k}_m": column for k, column in zip("xyz", place.T, strict=True)}
+        out |= {f"{of}_q{k}": column for k, column in zip("xyzw", read.as_quat().T, strict=True)}
+    return out
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.2, -0.1, 0.3), (2.0, -1.0, 1.5)])
 @pytest.mark.parametrize("conjugated", [False, True])
-def test_plane_axis_and_convention_are_found(conjugated: bool) -> None:
+def test_plane_axis_and_convention_are_found(conjugated: bool, turn: tuple[float, float, float]) -> None:
+    """Whatever the world's axes are, everything is told in the frame of the base."""
     trial = simulated("a", 1)
-    recording = recording_of(_log(columns_of(trial, conjugated), trial), "a")
+    columns = _turned(columns_of(trial, conjugated), Rotation.from_rotvec(turn), conjugated)
+    recording = recording_of(_log(columns, trial), "a")
     frame = frame_of([recording])
     assert frame.axis is not None
     assert frame.direction is not None
     assert abs(frame.axis[2]) > 0.999
     assert frame.direction[1] > 0.99
     assert frame.leans == pytest.approx(0.55, abs=0.02)
+    assert frame.planar_deg < 1.0
     assert frame.conjugated == conjugated
     assert any("look conjugated" in one.text for one in frame_findings(frame)) == conjugated
     again = trial_of(recording, frame, "a", 0.0)

@@ -73,8 +73,9 @@ class Recording:
     ----------
     command, pressure : (n,) kPa of the driven chamber, NaN where a cell is blank; None without. The command
         is a PWM value where `pwm`.
-    turned : (n, 3) rotation vectors of the tip in the frame of the base [rad]. chord : (n, 3) from base to
-        tip [m]. Both None for poses in the plane, or without motion capture.
+    turned, chord : (2, n, 3) rotation vectors of the tip [rad], and from base to tip [m], in the frame of the
+        base: with the quaternions as they are, and conjugated. Both None for poses in the plane, or without
+        motion capture.
     planar : (n, 2) angle [rad] and chord [m] in the plane, None without.
     findings : on the sensors.
     """
@@ -92,7 +93,7 @@ class Recording:
 
 
 def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors and chords (n, 3) in the frame of the base, NaN in rows without a pose.
+    """Rotation vectors and chords (2, n, 3) as in `Recording`, NaN in rows without a pose.
 
     Raises `BadInputError` for quaternions that are none.
     """
@@ -109,11 +110,13 @@ def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
                 f"{norm[wrong[0]]:.4g}, expected 1"
             )
     seen = np.isfinite(base).all(axis=1) & np.isfinite(tip).all(axis=1)
-    turned = np.full((len(tip), 3), np.nan)
+    turned, chord = np.full((2, 2, len(tip), 3), np.nan)
     first, last = (Rotation.from_quat(q[seen][:, [1, 2, 3, 0]]) for q in (base, tip))
-    turned[seen] = (first.inv() * last).as_rotvec()
     apart = np.stack([read[f"tip_{k}_m"] - read[f"base_{k}_m"] for k in "xyz"], axis=1)
-    return turned, apart
+    for way, (a, b) in enumerate([(first, last), (first.inv(), last.inv())]):
+        turned[way, seen] = (a.inv() * b).as_rotvec()
+        chord[way, seen] = a.inv().apply(apart[seen])
+    return turned, chord
 
 
 def _frozen(log: Log, name: str, driven: int) -> Iterator[Finding]:
@@ -163,7 +166,7 @@ def recording_of(log: Log, name: str) -> Recording:
     turned = chord = planar = None
     if all(one in log.columns for one in (*POSITION, *QUATERNION)):
         turned, chord = _poses(log)
-        findings += _jumps(log, name, turned, chord)
+        findings += _jumps(log, name, turned[0], chord[0])
     elif all(one in log.columns for one in _PLANAR):
         x, y, phi = (log.columns[one] for one in _PLANAR)
         apart = np.stack([x - log.columns.get("base_x_m", 0.0), y - log.columns.get("base_y_m", 0.0)], axis=1)
@@ -180,7 +183,9 @@ def recording_of(log: Log, name: str) -> Recording:
 def _stuck(recording: Recording) -> Iterator[Finding]:
     """Signals that keep their value while what they follow, or what follows them, moves."""
     t = recording.t_s
-    poses = recording.turned if recording.planar is None else recording.planar
+    poses = recording.planar
+    if poses is None and recording.turned is not None:
+        poses = recording.turned[0]
     signals = {"command": recording.command, "pressure": recording.pressure, "pose": poses}
     there = {name: values for name, values in signals.items() if values is not None and _range(values) > 0.0}
     for name, values in there.items():
@@ -226,7 +231,7 @@ def _unknown(recording: Recording) -> Iterator[Finding]:
 def _in_units(recording: Recording) -> list[Finding]:
     """What speaks of units other than metres and kPa. Raises `BadInputError` where no arm is so."""
     source, poses = recording.source, recording.chord
-    chord = None if poses is None else np.linalg.norm(poses, axis=1)
+    chord = None if poses is None else np.linalg.norm(poses[0], axis=1)
     if recording.planar is not None:
         chord = recording.planar[:, 1]
         most = float(np.nanmax(np.abs(recording.planar[:, 0]), initial=0.0))
@@ -277,14 +282,24 @@ def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterat
 def frame_of(recordings: Sequence[Recording]) -> Frame:
     """The axis of bending, the quaternions' convention and the straight arm's direction.
 
+    Of the two conventions that one is taken under which tip and chord turn the same way about the same axis.
+
     Raises `BadInputError` where the tip turns by less than 2 deg.
     """
-    with_poses = [
-        (one.turned, one.chord) for one in recordings if one.turned is not None and one.chord is not None
-    ]
-    if not with_poses:
+    if all(one.turned is None for one in recordings):
         return Frame(None, planar_sign(recordings))
-    turned, chord = (np.concatenate(parts) for parts in zip(*with_poses, strict=True))
+    frames = [_frame(recordings, conjugated) for conjugated in (False, True)]
+    return max(frames, key=lambda one: math.copysign(math.cos(math.radians(one.planar_deg)), one.leans))
+
+
+def _frame(recordings: Sequence[Recording], conjugated: bool) -> Frame:
+    """The frame under one convention, with a negative `leans` where the tip turns against its chord."""
+    parts = [
+        (one.turned[int(conjugated)], one.chord[int(conjugated)])
+        for one in recordings
+        if one.turned is not None and one.chord is not None
+    ]
+    turned, chord = (np.concatenate(of) for of in zip(*parts, strict=True))
     seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
     turned, chord = turned[seen], chord[seen]
     values, axes = np.linalg.eigh(np.cov(turned.T))
@@ -294,8 +309,8 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
             f"{recordings[0].source}: the tip turns by {math.degrees(math.sqrt(values[-1])):.2g} deg (RMS), "
             "expected the arm to bend"
         )
-    # About each recording's own middle, as base and camera may be moved between days.
-    centred = np.concatenate([one - np.nanmean(one, axis=0) for _, one in with_poses])[seen]
+    # About each recording's own middle, as the base's marker may be moved between days.
+    centred = np.concatenate([one - np.nanmean(one, axis=0) for _, one in parts])[seen]
     _, paths = np.linalg.eigh(np.cov(centred.T))
     normal = paths[:, 0]
     planar = math.degrees(math.acos(min(abs(float(axis @ normal)), 1.0)))
@@ -307,15 +322,13 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
     heading = np.arctan2(chord @ side, chord @ first)
     angle = turned @ axis
     leans, offset = np.polyfit(angle, heading, 1)
-    conjugated = bool(leans < 0.0)
     straight = first * math.cos(offset) + side * math.sin(offset)
-    # The angle grows with bending, whatever way that is.
-    axis = _grows(angle) * axis
     return Frame(
-        axis,
+        # The angle grows with bending, whatever way that is.
+        _grows(angle) * axis,
         planar_sign(recordings),
         conjugated,
-        abs(float(leans)),
+        float(leans),
         planar,
         straight / np.linalg.norm(straight),
     )
@@ -336,9 +349,9 @@ def planar_sign(recordings: Sequence[Recording]) -> float:
 def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
     """Raise `BadInputError` for poses that turn about another axis than that of an identified arm."""
     for one in recordings:
-        if frame.axis is None or one.turned is None or _range(one.turned) < 4.0 * _LEAST_TURN_RAD:
+        if frame.axis is None or one.turned is None or _range(one.turned[0]) < 4.0 * _LEAST_TURN_RAD:
             continue
-        axis = frame_of([one]).axis
+        axis = _frame([one], frame.conjugated).axis
         off = 0.0 if axis is None else math.acos(min(max(float(axis @ frame.axis), -1.0), 1.0))
         if off > _TURNED_OFF_RAD:
             raise BadInputError(
@@ -361,7 +374,7 @@ def frame_findings(frame: Frame) -> Iterator[Finding]:
     yield Finding(
         "remark",
         f"bends about ({x:z.2f}, {y:z.2f}, {z:z.2f}) of the base, straight it points along "
-        f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {frame.leans:.2f} of the tip's angle",
+        f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {abs(frame.leans):.2f} of the tip's angle",
     )
     stands = f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path"
     if math.radians(frame.planar_deg) > _NO_PLANE_RAD:
@@ -393,9 +406,10 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
     angle = chord = none
     unseen = None
     if recording.turned is not None and recording.chord is not None and frame.axis is not None:
-        angle = _between(grid, t, recording.turned @ frame.axis)
-        chord = _between(grid, t, np.linalg.norm(recording.chord, axis=1))
-        unseen = _gaps(grid, t, recording.turned)
+        turned = recording.turned[int(frame.conjugated)]
+        angle = _between(grid, t, turned @ frame.axis)
+        chord = _between(grid, t, np.linalg.norm(recording.chord[0], axis=1))
+        unseen = _gaps(grid, t, turned)
     elif recording.planar is not None:
         angle, chord = (_between(grid, t, column) for column in recording.planar.T)
         angle = frame.grows * angle

@@ -32,6 +32,7 @@ class Arm(Result):
     days : factors of parameters on each day, see `calib.stages.arm.model`; in files of earlier versions the
         factor of bends_rad_per_kpa alone.
     bending_axis : in the frame of the base; absent for poses in the plane.
+    conjugated : whether the logs' quaternions map the world to the body.
     interval_rad : half the 95 % interval of the angle of a further trial, from the errors on held trials.
     coverage : share of the samples of held trials inside the interval that the others' errors give.
     held : free-run errors on each trial from a fit to the others.
@@ -43,6 +44,7 @@ class Arm(Result):
     sigma: Sigma = {}
     days: dict[str, dict[str, Positive]] = {}
     bending_axis: Row3 | None = None
+    conjugated: bool = False
     chord_leans: NotNegative | None = quantity(None, label="chord's turn, of the tip's", digits=2)
     angle_error_rad: NotNegative | None = quantity(
         None, label="angle of a held trial", show="deg", digits=2, fact=True

@@ -149,7 +149,8 @@ def _solve(inputs: Inputs) -> Arm:
         sigma={name: float(value) for name, value in found.sigma.items()},
         days={day: dict(factors) for day, factors in made.days.items()},
         bending_axis=None if axis is None else axis.tolist(),
-        chord_leans=finite_or_none(inputs.frame.leans),
+        conjugated=inputs.frame.conjugated,
+        chord_leans=finite_or_none(abs(inputs.frame.leans)),
         angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
         chord_error_m=finite_or_none(mean_of(found.held, "chord_m")),
         by_pressure_error_rad=finite_or_none(mean_of(found.held, "angle_by_pressure_rad")),
@@ -336,7 +337,8 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
             "--load: the arm in the rig's file has no part load, expected one that was identified from a log "
             "with a load too"
         )
-    trials, _, findings = read_trials(files, options, Frame(None if axis is None else np.array(axis)))
+    frame = Frame(None if axis is None else np.array(axis), conjugated=arm.conjugated)
+    trials, _, findings = read_trials(files, options, frame)
     files.remarks += [one.text for one in findings]
     files.remarks += [
         f"{one.name}: day {one.day} is not in the rig, its factors are the means"
