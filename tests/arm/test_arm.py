@@ -178,6 +178,8 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
     texts = [one.text for one in recording_of(_log(columns, trial), "a").findings]
     assert any("p2_kpa, p3_kpa never change" in text for text in texts)
     assert any("line 702: motion capture jumps by 2." in text for text in texts)
+    fast = columns_of(replace(trial, angle_rad=0.4 + 0.4 * np.sin(5.0 * trial.t_s)))
+    assert "jumps" not in _said(fast, trial)
 
 
 def _said(columns: dict[str, FloatArray], trial: Trial) -> str:

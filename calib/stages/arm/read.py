@@ -23,8 +23,9 @@ from calib.stages.arm.model import STEP_S, Trial
 
 _PLANAR = ("tip_x_m", "tip_y_m", "tip_phi_rad")
 _FEWEST_S = 5.0
-_JUMP_RAD = math.radians(0.7)
-"""Between neighbours at 90 Hz: no arm of this kind turns as fast as 60 deg/s."""
+_JUMP_RAD, _ALONE = math.radians(0.7), 3.0
+"""A step between neighbours that is a jump, where it is so many times the usual one about it: an arm that
+turns at 60 deg/s makes as large ones at 90 Hz, one after the other."""
 _TILTED_RAD = math.radians(5.0)
 _LEAST_TURN_RAD = math.radians(2.0)
 _NO_PLANE_RAD = math.radians(45.0)
@@ -265,6 +266,8 @@ def _in_units(recording: Recording) -> list[Finding]:
 def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterator[Finding]:
     """Steps of rotations (n, ...) [rad] and places (n, ...) [m] that no arm makes."""
     step, moved = (np.linalg.norm(np.diff(one, axis=0), axis=1) for one in (turned, apart))
+    # What moves fast does so for several samples.
+    step, moved = (np.where(one > _ALONE * _usual(one), one, 0.0) for one in (step, moved))
     length = float(np.nanmedian(np.linalg.norm(apart, axis=1))) if np.isfinite(apart).any() else math.inf
     for steps, least, scale, unit in (
         (step, _JUMP_RAD, math.degrees(1.0), "deg"), (moved, _JUMP_SHARE * length, 1e3, "mm")
@@ -277,6 +280,12 @@ def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterat
                 f"{scale * steps[far[0]]:.1f} {unit} from one sample to the next; {len(far)} such jumps "
                 "in all",
             )
+
+
+def _usual(steps: FloatArray) -> FloatArray:
+    """Median of each of the steps (n,) and two neighbours on either side."""
+    padded = np.pad(np.nan_to_num(steps), 2, mode="edge")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
 def frame_of(recordings: Sequence[Recording]) -> Frame:
