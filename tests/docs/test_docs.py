@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from chromium import browser_or_skip
 from reference_pages import pages as generated_pages
@@ -95,6 +96,11 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     assert states.to_pandas()["sigma_q1_m"].notna().all()
     saved = names["calib"].Rig.load("rig.yaml")
     assert saved.camera == rig.camera and saved.actuator == rig.actuator
+    place = [[0.01, 0.06]]
+    pixels = rig.plane.to_pixels(place, rig.camera)
+    np.testing.assert_allclose(rig.plane.to_world(pixels, rig.camera), place, atol=1e-9)
+    seen = np.array(rig.plane.R_CW)[:, :2] @ place[0] + rig.plane.t_CW_m
+    np.testing.assert_allclose(rig.camera.project([seen, -seen]), [*pixels, [np.nan, np.nan]])
     assert Path("firmware_constants/calib_constants.h").is_file()
     assert "<table>" in rig.camera._repr_html_()
     assert set(names["calib"].plots(states)) == {

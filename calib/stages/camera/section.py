@@ -121,6 +121,24 @@ class Camera(Result):
             )
         return table
 
+    @property
+    def K(self) -> FloatArray:
+        """Intrinsic matrix (2.5), (3, 3), pixels."""
+        return self.optics.K
+
+    def project(self, points_m: ArrayLike) -> FloatArray:
+        """Pixels (n, 2), lens and all, of points (n, 3) in the camera's frame in metres.
+
+        NaN for points that the lens cannot see: behind a pinhole camera.
+        """
+        import numpy as np
+
+        from calib.stages.camera.model import project
+
+        camera, points = self.optics, np.asarray(points_m, dtype=np.float64).reshape(-1, 3)
+        behind = (points[:, 2] <= 0.0) & (not camera.fisheye)
+        return project(camera, np.where(behind[:, None], np.nan, points))
+
     def undistort(self, pixels: ArrayLike) -> FloatArray:
         """Pixels (n, 2) where a pinhole camera with the same intrinsics would have seen them."""
         import numpy as np
