@@ -207,10 +207,23 @@ def test_a_scale_that_no_sensor_has_is_poor(sensor: str, factor: float, word: st
     assert any(told in text for text in judged.reasons) == (word == "poor")
 
 
-def test_noise_and_a_walk_are_no_steps() -> None:
+@pytest.mark.parametrize(("axis", "size"), [(2, np.radians(0.3)), (4, 0.2)])
+def test_a_bias_that_drifts_as_the_sensor_warms_up_makes_it_poor(axis: int, size: float) -> None:
+    log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 720.0, 5)
+    warm = log.values.copy()
+    warm[:, axis] += size * (1.0 - np.exp(-log.t_s / 240.0))
+    judged = judge(analyse_static([replace(log, values=warm)]))
+    assert judged.word == "poor"
+    assert any(f"the mean of {AXES[axis]} drifts by +" in text for text in judged.reasons)
+    assert any("until its bias stays" in text for text in judged.advice)
+
+
+def test_noise_and_a_walk_are_no_steps_and_no_drift() -> None:
     for seed in range(12):
         imu = replace(IMU, gyro_walk=3e-5 * 2.0 ** (seed % 6), accel_walk=3e-4)
-        assert analyse_static([rest_log(imu, 400.0, seed)[0]]).logs[0].steps == ()
+        found = analyse_static([rest_log(imu, 400.0, seed)[0]])
+        assert found.logs[0].steps == ()
+        assert not any("drifts" in text for text in judge(found).reasons)
 
 
 @pytest.mark.parametrize(("lasts_s", "word"), [(0.5, "poor"), (5.0, "ok")])

@@ -346,25 +346,54 @@ def _turned_rad(log: StaticLog, columns: list[int]) -> float:
     return float(np.linalg.norm(means - means[0], axis=1).max()) / size
 
 
+def _effect(axis: str, size: float) -> tuple[float, str, str]:
+    """From what size on a change of an axis' mean matters, the change in words, and what it does to an angle."""
+    if axis.startswith("g"):
+        turned = 60.0 * math.degrees(abs(size))
+        effect = f"an angle from it turns by {turned:.2g} deg more in a minute"
+        return _LEAST_STEP_RADPS, f"{math.degrees(size):+.2g} deg/s", effect
+    effect = f"an angle from gravity turns by up to {math.degrees(abs(size) / 9.8):.2g} deg"
+    return _LEAST_STEP_MPS2, f"{size:+.2g} m/s^2", effect
+
+
 def _of_steps(log: StaticLog, noise: Sequence[AxisNoise]) -> Iterator[Finding]:
     """Findings on biases that jump, and what that does to an angle."""
     for step in log.steps[:_SHOWN_MOTIONS]:
         one = noise[step.axis]
+        _, size, effect = _effect(one.axis, step.size)
+        advice = "see whether the rig was touched then"
         if one.axis.startswith("g"):
-            size = f"{math.degrees(step.size):+.2g} deg/s"
-            turned = 60.0 * math.degrees(abs(step.size))
-            effect = f"an angle from it turns by {turned:.2g} deg more in a minute"
             advice = "learn the bias at each rest, and keep a sensor that calibrates itself from doing so"
-        else:
-            size = f"{step.size:+.2g} m/s^2"
-            effect = f"an angle from gravity turns by up to {math.degrees(abs(step.size) / 9.8):.2g} deg"
-            advice = "see whether the rig was touched then"
         text = f"{log.source}: the mean of {one.axis} steps by {size} at {step.at_s:.0f} s; {effect}"
         # A step within the stated deviation of the bias is a part of that.
         poor = abs(step.size) > 3.0 * one.sigma
         yield Finding("poor" if poor else "remark", text, advice if poor else "")
     if len(log.steps) > _SHOWN_MOTIONS:
         yield Finding("remark", f"{log.source}: {len(log.steps) - _SHOWN_MOTIONS} more steps of a mean")
+
+
+_END_SHARE, _MOST_DRIFT = 0.1, 3.5
+"""Parts of a log at its ends, and by how many deviations of a random walk their means may differ."""
+
+
+def _of_drift(log: StaticLog, noise: Sequence[AxisNoise], logs: int) -> Iterator[Finding]:
+    """Findings on biases that differ from a log's start to its end, as of a sensor that warms up."""
+    values = np.concatenate([part.values for part in log.parts])
+    size = max(round(_END_SHARE * len(values)), 1)
+    change = values[-size:].mean(axis=0) - values[:size].mean(axis=0)
+    for k, one in enumerate(noise):
+        if one.allan is None or any(step.axis == k for step in log.steps):
+            continue
+        # A walk goes as far as three times the variance of its mean about its end, K^2 T / 3.
+        walk = 3.0 * logs * one.sigma**2
+        white = 2.0 * one.allan.N.value**2 / (_END_SHARE * log.rest_s)
+        least, size_of, effect = _effect(one.axis, float(change[k]))
+        if abs(float(change[k])) > max(least, _MOST_DRIFT * math.sqrt(walk + white)):
+            advice = "let the sensor run until its bias stays, then log again"
+            if one.axis.startswith("a"):
+                advice += ", on a table that does not give way"
+            text = f"{log.source}: the mean of {one.axis} drifts by {size_of} from start to end; {effect}"
+            yield Finding("poor", text, advice)
 
 
 _LEAST_GYRO_NOISE = 1e-5
@@ -454,6 +483,11 @@ def judge(result: Static) -> Verdict:
         [
             *(finding for log in result.logs for finding in _of_log(log, result.axes)),
             *(finding for log in result.logs for finding in _of_steps(log, result.noise)),
+            *(
+                finding
+                for log in result.logs
+                for finding in _of_drift(log, result.noise, len(result.logs))
+            ),
             *(finding for noise in result.noise for finding in _of_axis(noise)),
             *_of_length(result),
         ]
