@@ -453,6 +453,8 @@ _BIN_S, _BINS = 0.5, 10
 _UPRIGHT, _LEAST_MPS2 = 0.75, 3.0
 _FELT_RAD, _ANSWERED = 0.03, 0.1
 """2 degrees, RMS: for half a second 0.03 g, of which a gyroscope that works shows more than a tenth."""
+_CARRIED_MPS = 0.3
+"""What carries a rig without turning it is slower, RMS, and would feel the same as a turn."""
 _STUCK_S, _SHAKEN_RAD = 1.0, 0.1
 """A reading that stays the same for so long while the accelerometer is shaken by 0.1 g."""
 
@@ -759,8 +761,9 @@ def _stopped(log: Log, held: Sequence[tuple[int, int]]) -> Finding | None:
 def _unmoved(log: Log) -> Finding | None:
     """Where the accelerometer moves and the gyroscope is stuck, or does not answer its turns.
 
-    For the latter both angles are averaged over half a second, in which a velocity of hands adds little, and
-    compared about their straight lines over five seconds, which take a bias out. Of a sensor that tilts
+    For the latter both angles are averaged over half a second and compared about their straight lines over
+    five seconds, which take a bias out. A sensor that is carried without turning feels its acceleration, whose
+    velocity stays small. Of a sensor that tilts
     the angle turns about all three axes (`calib.stages.imu.tracks`); far out of the plane it is none.
     """
     tilts = "az_mps2" in log.columns
@@ -799,8 +802,12 @@ def _unmoved(log: Log) -> Finding | None:
     k = t - t.mean(axis=1, keepdims=True)
     angles = angles - angles.mean(axis=2, keepdims=True)
     slope = np.einsum("wt,wat->wa", k, angles) / np.maximum((k * k).sum(axis=1), 1e-12)[:, None]
-    felt_rad, turned_rad = (angles - slope[:, :, None] * k[:, None, :]).std(axis=2).T
-    dead = np.flatnonzero(flat & (felt_rad > _FELT_RAD) & (turned_rad < _ANSWERED * felt_rad))
+    angles = angles - slope[:, :, None] * k[:, None, :]
+    felt_rad, turned_rad = angles.std(axis=2).T
+    carried_mps = GRAVITY_MPS2 * _BIN_S * np.cumsum(angles[:, 0], axis=1).std(axis=1)
+    dead = np.flatnonzero(
+        flat & (felt_rad > _FELT_RAD) & (turned_rad < _ANSWERED * felt_rad) & (carried_mps > _CARRIED_MPS)
+    )
     if len(dead) == 0:
         return None
     most = dead[np.argmax(felt_rad[dead])]

@@ -104,6 +104,9 @@ def test_a_gyroscope_that_does_not_answer_is_named() -> None:
         assert _log(gz_radps=still, **rest).signals(*IN_PLANE).findings == ()
     shaken = _log(gz_radps=noise, ax_mps2=G, ay_mps2=5.0 * np.sin(40.0 * t))
     assert shaken.signals(*IN_PLANE).findings == ()
+    # A slide goes to and fro by 0.2 m/s without turning.
+    slid = _log(gz_radps=noise, ax_mps2=G, ay_mps2=0.2 * 2.5 * np.sqrt(2.0) * np.cos(2.5 * t))
+    assert slid.signals(*IN_PLANE).findings == ()
     assert log.signals(*IN_PLANE).findings == ()
 
 
