@@ -52,6 +52,7 @@ from calib.stages.imu.tuning import (
     gain_facts,
     riccati,
     rms,
+    smooth_log,
     tune,
 )
 
@@ -606,6 +607,15 @@ def test_no_gains_are_ok_from_a_log_that_contradicts_itself(reference: bool) -> 
         found = contradictions(pieces, tune(pieces, DATA_SHEET))
         assert [one.text.split(":")[0] for one in found] == ["arm.csv"], way
         assert found[0].severity in ("poor", "inconsistent")
+
+
+@pytest.mark.parametrize(("factor", "late", "words"), [(1.2, 0, "turns 1.1"), (1.0, 8, "ms earlier")])
+def test_a_rate_of_another_scale_or_one_that_comes_late_is_named(factor: float, late: int, words: str) -> None:
+    """As of a data sheet's other range, and of a gyroscope whose low-pass is slower."""
+    piece = _piece(3, False)
+    rate = factor * piece.rate_radps[np.clip(np.arange(len(piece.t_s)) - late, 0, None)]
+    (found,) = contradictions(spoilt := [replace(piece, rate_radps=rate)], tune(spoilt, DATA_SHEET))
+    assert words in found.text
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.85, 1.2, 2.0, -1.0])

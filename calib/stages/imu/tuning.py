@@ -337,6 +337,7 @@ class Smoothed:
     gyro_noise : density of the rate's error [rad/s/sqrt(Hz)], at least that of the sensor.
     accel_noise : density of the accelerometer's angle at low frequencies, motion included [rad/sqrt(Hz)].
     bias_radps : of the rate, at the end of the log.
+    scale, scale_sigma : of the rate, over the angle's.
     lever_m : (2,) from the centre of rotation to the sensor, in its axes.
     """
 
@@ -345,6 +346,8 @@ class Smoothed:
     gyro_noise: float
     accel_noise: float
     bias_radps: float
+    scale: float
+    scale_sigma: float
     lever_m: FloatArray
 
 
@@ -540,12 +543,13 @@ def smooth_log(
     fine = _blocks(t, theta, rate_radps, phi_acc_rad, d, BLOCK_S)
     xs, Ps = np.empty((len(fine.d), _STATES)), np.empty((len(fine.d), _STATES, _STATES))
     _forward(fine.d, fine.X, fine.dt, fine.turn, q, q_b, r, tau, c, np.zeros(_STATES), P, xs, Ps)
-    last = xs[-1].copy()
+    last, scale_sigma = xs[-1].copy(), math.sqrt(float(Ps[-1, 2, 2]))
     variance = _backward(fine.dt, fine.turn, q, q_b, tau, c, xs, Ps)
     phi = theta + offset + np.interp(t, fine.t_s, xs[:, 0])
     # What lasts for tau counts at low frequencies with its size times the time that it lasts.
     slow = math.sqrt(r + 2.0 * c * c * tau)
-    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, -float(last[1]), last[3:5])
+    bias, scale = -float(last[1]), 1.0 - float(last[2])
+    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, bias, scale, scale_sigma, last[3:5])
 
 
 def damped(Kp: float, damping: float) -> Mahony:
@@ -889,6 +893,9 @@ _MOST_APART = 0.3
 _MOST_APART_RAD = math.radians(2.0)
 _MOST_LATE_S = 0.06
 _LEFT_OF_FELT, _LEFT_OF_REST = 0.2, 0.35
+_LATER_S = 0.03
+"""What a sensor's own low-pass at 5 Hz does to its readings."""
+_SURE = 3.0
 _LATE_S = 0.01 * np.arange(-30, 31)
 _MOST_RATE_ERROR = math.radians(1.5)
 _TIMES_THE_SENSOR = 10.0
@@ -987,6 +994,38 @@ def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> f
     return float(_LATE_S[k]) if clear and k not in (0, len(rests) - 1) else 0.0
 
 
+def _off(own: Smoothed) -> float:
+    """What the scale of the rate does to the angle over the log [rad, RMS]."""
+    return abs(own.scale - 1.0) * float(own.phi_rad.std())
+
+
+def _later(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> tuple[float, float]:
+    """As `_late`, of lags that are short beside the motion, and what it does to the angle [rad, RMS].
+
+    The difference of both angles is a lag times the rate, and a lever times the angular acceleration; its
+    deviation is that of sums over a second.
+    """
+    apart = _level(t_s, np.unwrap(phi_acc_rad) - integral(t_s, rate_radps))
+    turning = np.convolve(np.gradient(rate_radps, t_s), np.full(5, 0.2), "same")
+    known = np.isfinite(apart)
+    if int(known.sum()) < 20:
+        return 0.0, 0.0
+    X = np.stack([-_level(t_s, rate_radps)[known], _level(t_s, turning)[known]], axis=1)
+    apart, of = apart[known], (t_s[known] - t_s[0]).astype(np.int64)
+    kept, fit = np.ones(len(apart), dtype=np.bool_), np.zeros(2)
+    for _ in range(3):
+        fit = np.linalg.lstsq(X[kept], apart[kept], rcond=None)[0]
+        left = apart - X @ fit
+        kept = np.abs(left) <= 4.0 * max(_robust_size(left), 1e-6)
+    size = float(X[kept, 0] @ X[kept, 0])
+    together = np.bincount(of, np.where(kept, X[:, 0] * left, 0.0))
+    sigma = math.sqrt(float(together @ together)) / max(size, 1e-300)
+    late = float(fit[0])
+    if abs(late) - _SURE * sigma <= _LATER_S:
+        return 0.0, 0.0
+    return late, abs(late) * math.sqrt(size / int(kept.sum()))
+
+
 def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
     """Findings on logs whose rate, accelerometer and reference do not speak of the same motion.
 
@@ -1025,6 +1064,18 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
                     f"{math.degrees(result.noise.gyro):.2g}",
                     "poor",
                 )
+            elif abs(own.scale - 1.0) - _SURE * own.scale_sigma > _MOST_SCALE and _off(own) > _TURNS_RAD:
+                what = f"the rate turns {own.scale:.3g} times as far as the accelerometer's angle"
+                found(piece.source, f"rate and accelerometer contradict each other: {what}", "poor")
+            else:
+                late, off_rad = _later(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
+                if off_rad > _TURNS_RAD:
+                    when = "later" if late > 0.0 else "earlier"
+                    found(
+                        piece.source,
+                        f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's, "
+                        f"which is {math.degrees(off_rad):.2g} deg (RMS) in these turns",
+                    )
     offsets = [
         (piece.source, offset)
         for piece, offset in zip(pieces, result.offset_rad, strict=True)
@@ -1046,6 +1097,7 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
 # The section.
 
 _TILTED = 3.0
+_SCALED_RAD = math.radians(0.5)
 _RINGS = 0.5
 
 
@@ -1174,7 +1226,8 @@ def _filter_log(log: TuneLog, result: Tuning, first: int) -> FilterLog:
 
 def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterator[Finding]:
     """What is to be known of the gains, and of the logs that they are from."""
-    yield from contradictions([piece for log in logs for piece in log.pieces], result)
+    pieces = [piece for log in logs for piece in log.pieces]
+    yield from contradictions(pieces, result)
     gains, base = result.recommended.gains, result.candidates[0]
     if isinstance(gains, Mahony) and gains.Kp < 2.0 * _RINGS * math.sqrt(gains.Ki):
         yield Finding(
@@ -1196,6 +1249,17 @@ def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterato
             f"{math.degrees(result.noise.gyro):.2g}: it may be tilted out of the plane or its scale be off; "
             "with all six axes --rate up takes the tilt out.",
         )
+    for piece, own in zip(pieces, result.smoothed, strict=True):
+        if own is None or not _SURE * own.scale_sigma < abs(own.scale - 1.0) <= _MOST_SCALE:
+            continue
+        if _off(own) > _SCALED_RAD:
+            yield Finding(
+                "remark",
+                f"{piece.source}: the rate turns {own.scale:.3g} times as far as the accelerometer's angle, "
+                f"which is {math.degrees(_off(own)):.2g} deg (RMS) in these turns",
+                "find scales and biases by calib imu intrinsics"
+                + ("" if tilted else ", and see whether the sensor leans out of the plane (--rate up)"),
+            )
     if result.judge == "smoothed":
         yield Finding("remark", "Without a reference the logs are judged by their own smoothed angle.")
     for log in logs:
