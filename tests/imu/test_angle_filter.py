@@ -618,6 +618,15 @@ def test_a_rate_of_another_scale_or_one_that_comes_late_is_named(factor: float, 
     assert words in found.text
 
 
+def test_a_knock_does_not_bend_the_smoothed_angle() -> None:
+    piece, truth = _piece(1, False), swung(1).phi
+    knocked = piece.phi_acc_rad + np.where(np.abs(piece.t_s - 15.0) < 0.05, 1.0, 0.0)
+    found = smooth_log(piece.t_s, knocked, piece.rate_radps, DATA_SHEET.gyro, DATA_SHEET.walk)
+    off = found.phi_rad - truth
+    assert np.degrees(off.std()) < 0.15
+    assert found.scale == pytest.approx(1.005, abs=0.005)
+
+
 @pytest.mark.parametrize("factor", [0.5, 0.85, 1.2, 2.0, -1.0])
 def test_a_reference_that_turns_too_far_is_named(factor: float) -> None:
     """As a camera's does whose picture is mirrored, stretched, or of another plane."""

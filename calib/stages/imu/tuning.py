@@ -320,6 +320,8 @@ _LASTING_RAD = (2e-4, 6e-4, 2e-3, 6e-3, 2e-2, 6e-2)
 _NONE_RAD = 1e-6
 """Size of c where there is none, which keeps the covariance regular."""
 _STATES = 6
+_KNOCK = 6.0
+"""Standard deviations of an innovation from which on its variance is what it is itself."""
 _BIAS_SIGMA_RADPS = 0.05
 _SCALE_SIGMA = 0.02
 _LEVER_SIGMA_M = 0.3
@@ -400,6 +402,8 @@ def _forward(
             Ph[i] = P[i, 0] + P[i, 3] * h[3] + P[i, 4] * h[4] + P[i, 5]
         s += Ph[0] + h[3] * Ph[3] + h[4] * Ph[4] + Ph[5]
         e -= x[0] + h[3] * x[3] + h[4] * x[4] + x[5]
+        # A knock is no noise: what is further off counts for as little as if it were foreseen.
+        s = max(s, e * e / (_KNOCK * _KNOCK))
         for i in range(m):
             x[i] += Ph[i] / s * e
             for j in range(i + 1):
