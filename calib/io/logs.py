@@ -762,8 +762,8 @@ def _unmoved(log: Log) -> Finding | None:
     """Where the accelerometer moves and the gyroscope is stuck, or does not answer its turns.
 
     For the latter both angles are averaged over half a second and compared about their straight lines over
-    five seconds, which take a bias out. A sensor that is carried without turning feels its acceleration, whose
-    velocity stays small. Of a sensor that tilts
+    five seconds, which take a bias out. A sensor that is carried without turning feels its acceleration,
+    whose velocity stays small. Of a sensor that tilts
     the angle turns about all three axes (`calib.stages.imu.tracks`); far out of the plane it is none.
     """
     tilts = "az_mps2" in log.columns

@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from source_model import pose_from_configuration
 
 from calib import simulate
+from calib.io.logs import Log
 from calib.stages.actuator.kinematics import angle_from_marker, marker_from_head
 from calib.stages.imu.levelling import Levelling, level_three, system
 from calib.stages.imu.mahony import (
@@ -38,7 +39,7 @@ from calib.stages.imu.mahony import (
     filter_log,
     wrapped,
 )
-from calib.stages.imu.read import drift_log
+from calib.stages.imu.read import Reading, drift_log, tune_log
 from calib.stages.imu.sampling import AXES
 from calib.stages.imu.tracks import PEERS, missing, planar_rate, run_peer
 from calib.stages.imu.tuning import (
@@ -610,12 +611,29 @@ def test_no_gains_are_ok_from_a_log_that_contradicts_itself(reference: bool) -> 
 
 
 @pytest.mark.parametrize(("factor", "late", "words"), [(1.2, 0, "turns 1.1"), (1.0, 8, "ms earlier")])
-def test_a_rate_of_another_scale_or_one_that_comes_late_is_named(factor: float, late: int, words: str) -> None:
+def test_a_rate_of_another_scale_or_one_that_comes_late_is_named(
+    factor: float, late: int, words: str
+) -> None:
     """As of a data sheet's other range, and of a gyroscope whose low-pass is slower."""
     piece = _piece(3, False)
     rate = factor * piece.rate_radps[np.clip(np.arange(len(piece.t_s)) - late, 0, None)]
     (found,) = contradictions(spoilt := [replace(piece, rate_radps=rate)], tune(spoilt, DATA_SHEET))
     assert words in found.text
+
+
+def test_readings_at_the_end_of_their_range_make_it_poor_but_for_a_knock() -> None:
+    t, end = 0.01 * np.arange(3000), np.radians(250.0)
+    rng = np.random.default_rng(0)
+    phi, wave = 0.3 * np.sin(15.0 * t), 4.5 * np.cos(15.0 * t)
+    columns = {"ax_mps2": 9.8 * np.cos(phi), "ay_mps2": 9.8 * np.sin(phi)}
+    columns = {name: values + 0.02 * rng.normal(size=3000) for name, values in columns.items()}
+    for gz, words in (
+        (np.clip(-wave, -end, end), ["gz is at the end of its range"]),
+        (np.where(np.abs(t - 9.0) < 0.01, end, -0.9 * wave), []),
+    ):
+        log = Log("log.csv", t, columns | {"gz_radps": gz}, np.arange(3000))
+        found = tune_log(log, Reading(False, "none")).findings
+        assert [one.text[:29] for one in found if one.severity == "poor"] == words
 
 
 def test_a_knock_does_not_bend_the_smoothed_angle() -> None:

@@ -475,7 +475,7 @@ def solve_drift(inputs: DriftInputs) -> Drift:
 
 def _remarks(log: Readings, sampling: Sampling, truth_late_s: float) -> Iterator[str]:
     """Sentences about a log, whose truth was moved by so much."""
-    for finding in sampling_findings(sampling, source=log.source):
+    for finding in sampling_findings(sampling, log.axes, log.source):
         yield finding.text
     if truth_late_s:
         yield (

@@ -27,6 +27,7 @@ from calib.stages.imu.sampling import (
     AXES,
     MOST_GYRO_RADPS,
     Readings,
+    limit_findings,
     quiet_spread,
     regular_parts,
     sampling_findings,
@@ -106,6 +107,7 @@ def drift_log(log: Log) -> Readings:
 _TUNELOGS_FEWEST = 20
 _SHORTEST_S = 1.0
 """Pieces of less are passed over."""
+_MOST_AT_LIMIT = 1e-3
 _APART = 0.03
 """Share of the rate by which -gz may differ from the up vector's."""
 
@@ -224,7 +226,13 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
         )
     sampling, parts = regular_parts(read)
     period = sampling.period_s
-    said += [one.text for one in sampling_findings(sampling, read.axes, log.source)]
+    said += [one.text for one in sampling_findings(sampling, source=log.source)]
+    # The angle takes three of the axes; readings of a knock are too few to matter.
+    limits = (
+        one
+        for one in limit_findings(sampling, read.axes, _MOST_AT_LIMIT)
+        if one.text[:2] in ("gz", "ax", "ay")
+    )
     kept = [part for part in parts if len(part.values) * period >= _SHORTEST_S]
     if not kept:
         raise BadInputError(
@@ -252,7 +260,8 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
             f"{log.source}: the sensor tilts out of the plane, where -gz is not the rate of the angle; "
             "--rate up takes it from the up vector"
         )
-    return TuneLog(log.source, sampling, tuple(pieces), named, lag, quiet, tuple(said), read.findings)
+    findings = (*limits, *read.findings)
+    return TuneLog(log.source, sampling, tuple(pieces), named, lag, quiet, tuple(said), findings)
 
 
 # ----------------------------------------------------------------------

@@ -125,9 +125,8 @@ def sampling_findings(
     for gap in s.gaps:
         if gap.split:
             yield Finding("remark", f"{lead}split at a gap of {gap.duration_s:.4g} s after {gap.at_s:.2f} s")
-    for axis, count in zip(axes, s.at_limit.tolist(), strict=False):
-        if count:
-            yield Finding("poor", f"{lead}{axis} is at the end of its range in {count} samples")
+    for finding in limit_findings(s, axes):
+        yield replace(finding, text=f"{lead}{finding.text}")
     short = [gap for gap in s.gaps if not gap.split]
     if short:
         longest = max(short, key=lambda gap: gap.duration_s)
@@ -148,6 +147,18 @@ def sampling_findings(
             f"{lead}{s.repeated_stamps} time stamps ({s.repeated_stamps / s.samples:.2%}) repeat the one "
             "before with other readings; counted as samples of their own",
         )
+
+
+def limit_findings(s: Sampling, axes: Sequence[str], most: float = 0.0) -> Iterator[Finding]:
+    """Axes whose readings are at the end of their range; poor above a share `most` of the samples."""
+    for axis, count in zip(axes, s.at_limit.tolist(), strict=False):
+        if count:
+            poor = count > most * s.samples
+            yield Finding(
+                "poor" if poor else "remark",
+                f"{axis} is at the end of its range in {count} samples",
+                "set the sensor to a wider range, or move it more slowly" if poor else "",
+            )
 
 
 def _step(values: FloatArray) -> float:

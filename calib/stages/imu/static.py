@@ -347,7 +347,7 @@ def _turned_rad(log: StaticLog, columns: list[int]) -> float:
 
 
 def _effect(axis: str, size: float) -> tuple[float, str, str]:
-    """From what size on a change of an axis' mean matters, the change in words, and what it does to an angle."""
+    """From what size a change of an axis' mean matters, the change in words, what it does to an angle."""
     if axis.startswith("g"):
         turned = 60.0 * math.degrees(abs(size))
         effect = f"an angle from it turns by {turned:.2g} deg more in a minute"
@@ -483,11 +483,7 @@ def judge(result: Static) -> Verdict:
         [
             *(finding for log in result.logs for finding in _of_log(log, result.axes)),
             *(finding for log in result.logs for finding in _of_steps(log, result.noise)),
-            *(
-                finding
-                for log in result.logs
-                for finding in _of_drift(log, result.noise, len(result.logs))
-            ),
+            *(finding for log in result.logs for finding in _of_drift(log, result.noise, len(result.logs))),
             *(finding for noise in result.noise for finding in _of_axis(noise)),
             *_of_length(result),
         ]
