@@ -636,6 +636,17 @@ def test_readings_at_the_end_of_their_range_make_it_poor_but_for_a_knock() -> No
         assert [one.text[:29] for one in found if one.severity == "poor"] == words
 
 
+def test_a_quick_swing_does_not_bend_the_smoothed_angle() -> None:
+    """At 4 Hz the accelerometer feels the lever more than the angle; means over 0.5 s see neither."""
+    log = simulate("swing", seed=0, duration="20s")
+    piece = tune_log(log, Reading(False, "truth")).pieces[0]
+    assert piece.reference_rad is not None
+    run = (piece.t_s, piece.phi_acc_rad, piece.rate_radps)
+    found = smooth_log(*run, DATA_SHEET.gyro, DATA_SHEET.walk)
+    assert np.degrees(np.nanstd(found.phi_rad - piece.reference_rad)) < 0.3
+    assert abs(found.scale - 1.0) < 0.1
+
+
 def test_a_knock_does_not_bend_the_smoothed_angle() -> None:
     piece, truth = _piece(1, False), swung(1).phi
     knocked = piece.phi_acc_rad + np.where(np.abs(piece.t_s - 15.0) < 0.05, 1.0, 0.0)

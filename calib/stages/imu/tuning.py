@@ -319,6 +319,7 @@ _LASTING_S = (0.3, 1.0, 3.0)
 _LASTING_RAD = (2e-4, 6e-4, 2e-3, 6e-3, 2e-2, 6e-2)
 _NONE_RAD = 1e-6
 """Size of c where there is none, which keeps the covariance regular."""
+_NOISIER = 9
 _STATES = 6
 _KNOCK = 6.0
 """Standard deviations of an innovation from which on its variance is what it is itself."""
@@ -497,20 +498,25 @@ def _likelihoods(
     return out
 
 
+def _most_likely(blocks: _Blocks, q_b: float, P: FloatArray, tried: FloatArray) -> FloatArray:
+    """Row (4,) of highest likelihood of `tried` (n, 4)."""
+    few = slice(0, _LIKELY_BLOCKS)
+    data = (blocks.d[few], blocks.X[few], blocks.dt[few], blocks.turn[few])
+    return np.asarray(tried[int(np.argmax(_likelihoods(*data, q_b, P.copy(), tried)))])
+
+
 def _likely(blocks: _Blocks, q_least: float, q_b: float, r_least: float, P: FloatArray) -> FloatArray:
     """q, r, tau and c of highest likelihood: over wide steps, then over narrow ones about the best."""
-    few = slice(0, _LIKELY_BLOCKS)
-    data = (blocks.d[few], blocks.X[few], blocks.dt[few], blocks.turn[few], q_b, P.copy())
     q, r = q_least * 4.0 ** np.arange(11), r_least * 4.0 ** np.arange(12)
     lasting = [(1.0, _NONE_RAD), *((tau, c) for tau in _LASTING_S for c in _LASTING_RAD)]
     rows = np.array([(a, b, tau, c) for a in q.tolist() for b in r.tolist() for tau, c in lasting])
-    best = rows[int(np.argmax(_likelihoods(*data, rows)))]
+    best = _most_likely(blocks, q_b, P, rows)
     for step in (2.0, math.sqrt(2.0)):
         about = (1.0 / step, 1.0, step)
         rows = np.array([best * (a, b, e, f) for a in about for b in about for e in about for f in about])
         rows = np.maximum(rows, [q_least, r_least, 0.1, _NONE_RAD])
-        best = rows[int(np.argmax(_likelihoods(*data, rows)))]
-    return np.asarray(best)
+        best = _most_likely(blocks, q_b, P, rows)
+    return best
 
 
 def smooth_log(
@@ -545,6 +551,9 @@ def smooth_log(
     q, r, tau, c = _likely(coarse, gyro_noise**2, q_b, r_least, P).tolist()
     P[5, 5] = c * c
     fine = _blocks(t, theta, rate_radps, phi_acc_rad, d, BLOCK_S)
+    # What swings within half a second is noise that only the fine blocks show.
+    noisier = np.array([(q, r * 4.0**k, tau, c) for k in range(_NOISIER)])
+    r = float(_most_likely(fine, q_b, P, noisier)[1])
     xs, Ps = np.empty((len(fine.d), _STATES)), np.empty((len(fine.d), _STATES, _STATES))
     _forward(fine.d, fine.X, fine.dt, fine.turn, q, q_b, r, tau, c, np.zeros(_STATES), P, xs, Ps)
     last, scale_sigma = xs[-1].copy(), math.sqrt(float(Ps[-1, 2, 2]))
@@ -1016,9 +1025,9 @@ def _later(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> 
         return 0.0, 0.0
     X = np.stack([-_level(t_s, rate_radps)[known], _level(t_s, turning)[known]], axis=1)
     apart, of = apart[known], (t_s[known] - t_s[0]).astype(np.int64)
-    kept, fit = np.ones(len(apart), dtype=np.bool_), np.zeros(2)
+    kept, fit = np.isfinite(apart), np.zeros(2)
     for _ in range(3):
-        fit = np.linalg.lstsq(X[kept], apart[kept], rcond=None)[0]
+        fit = np.asarray(np.linalg.lstsq(X[kept], apart[kept], rcond=None)[0], dtype=np.float64)
         left = apart - X @ fit
         kept = np.abs(left) <= 4.0 * max(_robust_size(left), 1e-6)
     size = float(X[kept, 0] @ X[kept, 0])
