@@ -14,6 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import PoseOptions
 from calib.core.rig import Rig
+from calib.io.columns import is_arm_log
 from calib.io.logs import Log, check_time, read_log
 from calib.io.tables import read_cells
 from calib.stages.actuator.identify import Start, Track, without_outliers
@@ -339,10 +340,12 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
     end = float(log.t_s[-1])
     if not len(log.sampled("pwm1", "pwm2")):
         if not no_pwm:
-            raise BadInputError(
-                f"{log.source}: has no commands, expected pwm1 and pwm2; for a swing with the hoses off give "
-                "--no-pwm"
+            meant = (
+                "it has those of an arm: identify it by calib identify arm"
+                if is_arm_log(tuple(log.columns))
+                else "for a swing with the hoses off give --no-pwm"
             )
+            raise BadInputError(f"{log.source}: has no commands, expected pwm1 and pwm2; {meant}")
         begin = float(log.t_s[0])
         return begin, TICK_S, np.zeros((max(math.ceil((end - begin) / TICK_S) + 1, 2), 2))
     commands = log.signals("pwm1", "pwm2")
