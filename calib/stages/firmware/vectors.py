@@ -189,28 +189,45 @@ def vectors(
 
 _NAN = 3e38
 """Stands for NaN in the rows."""
+_UNEVEN = (1.0, 1.2, 1.4, 1.1, 1.3, 1.5, 1.7, 1.6, 1.8)
+_WEIGHTS = tuple(
+    float(np.float32(factor / TOLERANCE[name]))
+    for factor, name in zip(_UNEVEN, ("phi_rad", *["marker_m"] * 2, *["q_m"] * 4, *["pwm"] * 2), strict=True)
+)
+_TOGETHER = 4.0
+"""Tolerances by which a tick's weighted sum may be off. What binary32 leaves, adding up included, is 0.6."""
 
 
-def _row(vector: Vector) -> list[list[float]]:
-    """Inputs, outputs and flags of a tick; zero where a value is too small for a normal float."""
-    given, wanted = vector.given, vector.wanted
-    inputs = [_NAN if math.isnan(value) else value for value in given.numbers]
-    sensors = given.sensors + 4 * (vector.times - 1)
-    rows = [[*inputs, sensors, given.mode], wanted.numbers, [wanted.flags]]
-    return [[float(v) if abs(v) > 1e-30 else 0.0 for v in row] for row in rows]
+def _row(vector: Vector) -> list[float]:
+    """Inputs and the weighted sum of what a tick gives; zero for what is too small for a normal float."""
+    inputs = [_NAN if math.isnan(value) else value for value in vector.given.numbers]
+    row = [*inputs, float(np.dot(_WEIGHTS, vector.wanted.numbers))]
+    return [float(v) if abs(v) > 1e-30 else 0.0 for v in row]
+
+
+def _words(made: list[Vector]) -> list[int]:
+    """What came with the inputs, mode and repetitions, and flags, two for each tick."""
+    words = [
+        (one.given.sensors + 4 * one.given.mode + 32 * (one.times - 1), one.wanted.flags) for one in made
+    ]
+    return [word for pair in words for word in pair]
 
 
 def selftest_rows(constants: Mapping[str, float]) -> dict[str, Any]:
-    """What calib_selftest.h is made of: rows of numbers for CALIB_FUSED 0 and 1, and CALIB_UNDISTORT."""
+    """What calib_selftest.h is made of: tables for CALIB_FUSED 0 and 1, and CALIB_UNDISTORT."""
     fused = vectors(constants, FUSED_TICKS, fused=True, limits=True) if constants["CALIB_HAS_FUSED"] else []
     plain = vectors(constants, limits=True)
     return {
         "undistort": int(constants["CALIB_HAS_PLANE"] and Reference(constants).undistort),
         "rows": list(map(_row, plain)),
         "fused_rows": list(map(_row, fused)),
+        "words": _words(plain),
+        "fused_words": _words(fused),
         "counts": plain[-1].counts,
         "fused_counts": fused[-1].counts if fused else plain[-1].counts,
         "tolerance": TOLERANCE,
+        "weights": list(_WEIGHTS),
+        "limit": _TOGETHER,
     }
 
 

@@ -65,9 +65,11 @@
 #include <avr/pgmspace.h>
 #define CALIB_IN_FLASH PROGMEM
 #define CALIB_TABLE_READ(address) pgm_read_float(address)
+#define CALIB_WORD_READ(address) pgm_read_word(address)
 #else
 #define CALIB_IN_FLASH
 #define CALIB_TABLE_READ(address) (*(address))
+#define CALIB_WORD_READ(address) (*(address))
 #endif
 
 #define CALIB_SCHEMA 7
