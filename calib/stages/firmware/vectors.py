@@ -95,6 +95,10 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     made: list[tuple[Inputs, int]] = []
     for lost in (replace(still, marker_seen=False), replace(still, imu_read=False)):
         made += [(still, 2), (lost, hold), (lost, 1), (still, 1)]
+    # A picture that is left out is none, and the pumps do not go on for it.
+    boost = int(constants.get("CALIB_FUSED_BOOST_TICKS", 0))
+    away = replace(still, u_px=_elsewhere(still.u_px))
+    made += [(still, boost + 2), (replace(still, marker_seen=False), hold - 1), (away, 2), (still, 1)]
     weak = {
         f"a{axis}_mps2": 0.9 * constants["CALIB_IMU_ACCEL_WEAK_MPS2"]
         + constants[f"CALIB_IMU_ACCEL_BIAS_{name}"]
@@ -169,9 +173,8 @@ def vectors(
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
     still = run[0]
     # What is known first is that the head is bent, and turns.
-    bent = max(
-        range(ticks), key=lambda k: abs(run[k].ay_mps2) if run[k].marker_seen and run[k].imu_read else 0.0
-    )
+    rest, both = constants["CALIB_IMU_GYRO_BIAS_RADPS"], [one.marker_seen and one.imu_read for one in run]
+    bent = max(range(ticks), key=lambda k: both[k] * abs(run[k].ay_mps2 * (run[k].gz_radps - rest)))
     run = [*run[bent:], *run[:bent]]
     given = [(one, 1) for one in run]
     if limits:
@@ -373,12 +376,16 @@ def spoilt(given: Inputs, k: int) -> Inputs:
     return given
 
 
+def _elsewhere(u_px: float) -> float:
+    """Where something else than the marker is in the picture."""
+    return u_px + (25.0 if u_px < 150.0 else -25.0)
+
+
 def _disturbed(given: Inputs, k: int, period: int) -> Inputs:
     at = k % period
     given = spoilt(given, k)
     if k % 43 == 33:
         given = replace(given, ax_mps2=0.1, ay_mps2=-0.1)
     if k % 23 == 14 or 3 * period // 10 <= at < 3 * period // 10 + 8:
-        # Something else in the picture.
-        given = replace(given, u_px=given.u_px + (25.0 if given.u_px < 150.0 else -25.0))
+        given = replace(given, u_px=_elsewhere(given.u_px))
     return given
