@@ -132,6 +132,8 @@ _FASTEST_RADPS = 45.0
 _LARGEST_BIAS_RADPS = 0.35
 _LOUDEST_RADPS, _QUIETEST_RADPS = 0.02, 1.5e-4
 """Spread of a gyroscope at rest: no sensor is louder, and none of those on cheap boards is quieter."""
+_QUIET_RADPS = 0.005
+"""Spread at rest of those on cheap boards; one that is in deg/s is quieter than that in none."""
 _REST_RAD = 0.02
 _FARTHER = 12.0
 _LEAST_TURN_RAD, _LEAST_NOISE_RAD = 0.05, 1e-5
@@ -873,13 +875,16 @@ def _implausible(
     # An accelerometer that is stuck says nothing about the gyroscope.
     felt = found.by_force_rad > _LEAST_NOISE_RAD
     least_rad = max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad)
-    if felt and found.flat and scale * found.by_gyro_rad > least_rad:
+    calm = calm_windows(readings)[:, :, -len(names) :]
+    spread = scale * np.median(calm.std(axis=1), axis=0)
+    at_rest = found.spread_rad < _REST_RAD
+    # At rest a gyroscope that is as quiet as one in this unit turns by its bias.
+    biased = at_rest and float(spread.max()) < _QUIET_RADPS
+    if felt and found.flat and not biased and scale * found.by_gyro_rad > least_rad:
         times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
         return f"turns {times:.3g} times as far as the accelerometer's angle"
-    if found.spread_rad < _REST_RAD:
-        calm = calm_windows(readings)[:, :, -len(names) :]
+    if at_rest:
         bias = scale * float(np.abs(np.median(calm, axis=(0, 1))).max())
-        spread = scale * np.median(calm.std(axis=1), axis=0)
         if bias > _LARGEST_BIAS_RADPS:
             return f"has a bias of {bias:.3g} rad/s at rest"
         if float(spread.max()) > _LOUDEST_RADPS:

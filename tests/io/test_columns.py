@@ -222,6 +222,15 @@ def test_a_board_that_lies_flat_tells_the_unit_of_its_gyroscope(
     assert np.allclose(read_log(path).columns["gz_radps"], values[:, 5], atol=1e-6)
 
 
+@pytest.mark.parametrize("names", [["t_s", *AXES], ["t", "ax", "ay", "az", "gx", "gy", "gz"]])
+def test_a_large_bias_at_rest_is_no_turn(tmp_path: Path, names: list[str]) -> None:
+    """An MPU6050 may be off by 20 deg/s."""
+    t, values = _imu(moving=False)
+    values = values + np.array([0.0, 0.0, 0.0, 0.2, -0.15, 0.25])
+    log = read_log(_written(tmp_path / "log.csv", names, [t, *values.T]))
+    assert np.allclose(log.columns["gz_radps"], values[:, 5], atol=1e-6)
+
+
 def test_a_unit_that_a_person_states(tmp_path: Path) -> None:
     t, values = _imu()
     columns = [t, *(values[:, :3] / G).T, *(values[:, 3:] / DEGREE).T]
