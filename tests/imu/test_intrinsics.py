@@ -447,6 +447,14 @@ def test_a_side_that_lacks_is_named(axis: int, sign: float, word: str) -> None:
     assert f"add rests with the {name} axis {word}" in found.advice
 
 
+def test_six_poses_do_not_blame_the_unit_of_the_gyroscope() -> None:
+    turns = (("x", 0.0), ("x", 180.0), ("x", 90.0), ("x", 270.0), ("y", 90.0), ("y", 270.0))
+    six = [Rotation.from_euler(axis, angle, degrees=True) for axis, angle in turns]
+    found = _judge(pose_log(six, SENSOR))
+    assert found.word == "unidentifiable"
+    assert not any("--gyro-unit" in advice for advice in found.advice)
+
+
 def test_a_cap_of_the_sphere_is_unidentifiable() -> None:
     poses = [pose for pose in sphere_poses(90) if _up(pose)[2] > 0.8]
     found = _judge(pose_log(poses, SENSOR))

@@ -1125,7 +1125,9 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
     used = np.isfinite(gyro.scale)
     if "g" not in result.log.counts:
         so = "its readings are not in the unit that was named"
-        yield from _off_scale(gyro.scale[used], "a scale of the gyroscope", so, "check --gyro-unit")
+        told = gyro.scale[used & np.isfinite(gyro.scale_sigma)]
+        if len(told):
+            yield from _off_scale(told, "a scale of the gyroscope", so, "check --gyro-unit")
     for k in np.flatnonzero(used).tolist():
         travel = float(gyro.travel_rad[k])
         if travel < _LEAST_TRAVEL_RAD:
