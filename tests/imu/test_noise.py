@@ -207,6 +207,19 @@ def test_a_scale_that_no_sensor_has_is_poor(sensor: str, factor: float, word: st
     assert any(told in text for text in judged.reasons) == (word == "poor")
 
 
+def test_a_rig_that_is_held_in_a_hand_is_not_at_rest() -> None:
+    log, _ = rest_log(IMU, 120.0, 3)
+    held = log.values.copy()
+    share = np.exp(-2.0 * np.pi * 2.0 / 100.0)
+    tremor = lfilter(
+        [1.0 - share], [1.0, -share], np.random.default_rng(3).normal(size=(len(held), 3)), axis=0
+    )
+    held[:, :3] += 0.01 / tremor.std() * tremor
+    judged = judge(analyse_static([replace(log, values=held)]))
+    assert judged.word == "poor"
+    assert any("more than any gyroscope has" in text for text in judged.reasons)
+
+
 @pytest.mark.parametrize(("axis", "size"), [(2, np.radians(0.3)), (4, 0.2)])
 def test_a_bias_that_drifts_as_the_sensor_warms_up_makes_it_poor(axis: int, size: float) -> None:
     log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 720.0, 5)

@@ -307,24 +307,24 @@ _MOST_ROUNDED_RADPS, _MOST_ROUNDED_MPS2 = 1e-3, 0.02
 _LEAST_REST_S = 10.0
 _LEAST_CHANCE = 1e-4
 _SHOWN_MOTIONS = 3
+_AGAIN = "log again with the rig untouched, on a table that does not shake"
 
 
 def _of_log(log: StaticLog, axes: tuple[str, ...]) -> Iterator[Finding]:
     """Findings on motion and on how a log was sampled."""
-    again = "log again with the rig untouched, on a table that does not shake"
     moved = log.moved_share > _MOVED_SHARE
     severity: Severity = "poor" if moved else "remark"
     for motion in log.motions[:_SHOWN_MOTIONS]:
         text = f"{log.source}: moves from {motion.from_s:.1f} to {motion.to_s:.1f} s, seen most in "
         text += f"{axes[motion.axis]}; that stretch is left out"
-        yield Finding(severity, text, again if moved else "")
+        yield Finding(severity, text, _AGAIN if moved else "")
     more = len(log.motions) - _SHOWN_MOTIONS
     if more > 0:
         yield Finding(severity, f"{log.source}: moves {more} more times")
     columns = [k for k, axis in enumerate(axes) if axis.startswith("a")]
     if log.motions and (turned := _turned_rad(log, columns)) > _TILTED_RAD:
         text = f"{log.source}: lies {math.degrees(turned):.2g} deg otherwise after it has moved; the mean of "
-        yield Finding("poor", f"{text}the accelerometer is that of no pose", advice=again)
+        yield Finding("poor", f"{text}the accelerometer is that of no pose", advice=_AGAIN)
     force = float(np.median([np.linalg.norm(part.values[:, columns].mean(axis=0)) for part in log.parts]))
     if len(columns) == 3 and abs(force / _GRAVITY_MPS2 - 1.0) > _MOST_OFF_GRAVITY:
         yield Finding(
@@ -397,7 +397,9 @@ def _of_drift(log: StaticLog, noise: Sequence[AxisNoise], logs: int) -> Iterator
 
 
 _LEAST_GYRO_NOISE = 1e-5
-"""A quarter of what the best micromachined gyroscopes have, in rad/s/sqrt(Hz)."""
+_MOST_GYRO_NOISE = 2e-3
+"""A quarter of what the best micromachined gyroscopes have, and three times what the worst have, in
+rad/s/sqrt(Hz)."""
 
 
 def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
@@ -427,6 +429,13 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
             f"{axis}: its noise of {math.degrees(N.value):.2g} deg/s/sqrt(Hz) is less than any small "
             f"gyroscope has ({math.degrees(4.0 * _LEAST_GYRO_NOISE):.2g})",
             "look whether its unit is rad/s where deg/s is stated, or a filter hides its noise",
+        )
+    if axis.startswith("g") and N.value > _MOST_GYRO_NOISE and noise.rounded == 0.0:
+        yield Finding(
+            "poor",
+            f"{axis}: its noise of {math.degrees(N.value):.2g} deg/s/sqrt(Hz) is more than any gyroscope has "
+            f"({math.degrees(_MOST_GYRO_NOISE):.2g}): the rig was held, or shaken throughout",
+            _AGAIN,
         )
     if allan.chance < _LEAST_CHANCE:
         off, tau_s = _colour(allan)
