@@ -234,6 +234,14 @@ def test_a_slow_rotation_is_not_taken_for_a_bias() -> None:
     gyro = np.tile([0.0, 0.0, -math.radians(3.0)], (3000, 1))
     up = level_three(Levelling(), t, force, gyro)
     assert np.abs(wrapped(np.arctan2(up[:, 1], up[:, 0]) - angle)).max() < math.radians(0.2)
+    # Where a slow sway turns round it stays within a degree for seconds.
+    t = DT * np.arange(12000)
+    angle = math.radians(4.0) * np.sin(0.15 * t)
+    force = 9.81 * np.stack([np.cos(angle), np.sin(angle), np.zeros(12000)], axis=1)
+    gyro = np.zeros((12000, 3))
+    gyro[:, 2] = -math.radians(4.0) * 0.15 * np.cos(0.15 * t)
+    up = level_three(Levelling(), t, force, gyro)
+    assert np.abs(wrapped(np.arctan2(up[:, 1], up[:, 0]) - angle)).max() < math.radians(0.35)
 
 
 def test_untuned_levelling_beats_the_best_gains_of_the_published_filter() -> None:

@@ -192,7 +192,7 @@ _REST_S = 2.0
 _START_S = 10.0
 _QUIET_RADPS = 0.02
 _QUIET_G = 0.05
-_TURNED_G = 0.015
+_TURNED_G = 0.005
 """Rest: readings this near to their means, and a mean force that has moved by no more since rest began."""
 
 
