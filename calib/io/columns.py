@@ -171,7 +171,8 @@ def is_arm_log(names: Sequence[str]) -> bool:
 
 def known_name(name: str) -> tuple[str, str] | None:
     """The column that a name in a file means, and the unit that it states or ""; None for another."""
-    name = name.strip()
+    # Headers of EuRoC and of rostopic begin as comments do.
+    name = name.strip().lstrip("#% ")
     if name == "t_s" or name in COLUMNS:
         return name, next(iter(UNITS.get(kind_of(name), {"": 1.0})))
     unit = ""

@@ -51,6 +51,8 @@ def _written(
         ("ax", ("ax_mps2", "")),
         ("Accelerometer X (g)", ("ax_mps2", "g")),
         ("imu.linear_acceleration.y", ("ay_mps2", "")),
+        ("%time", ("t_s", "")),
+        ("#timestamp [ns]", ("t_s", "ns")),
         ("a_RS_S_z [m s^-2]", ("az_mps2", "m/s2")),
         ("gyro_z", ("gz_radps", "")),
         ("GyroZ_dps", ("gz_radps", "deg/s")),
