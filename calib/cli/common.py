@@ -13,7 +13,7 @@ from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
-from calib.core.errors import CalibError, ReaderGoneError, UsageError
+from calib.core.errors import BadInputError, CalibError, ReaderGoneError, UsageError
 from calib.core.files import one_line, shown
 from calib.core.stage import ProgressCall, finite
 from calib.core.words import Table, as_text
@@ -57,6 +57,14 @@ def check_log_name(output: Path) -> None:
     """Raise `UsageError` for a name that a log cannot have."""
     if output.suffix.lower() not in (".csv", ".parquet") and not writes_through(output):
         raise UsageError(f"{shown(output)}: expected a name that ends in .csv or .parquet")
+
+
+def refuse_recorded(output: Path) -> None:
+    """Raise `BadInputError` where a recording is already."""
+    if output.is_file() and output.stat().st_size:
+        raise BadInputError(
+            f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"
+        )
 
 
 def narrate(message: str) -> None:
@@ -115,6 +123,7 @@ def progress_bar(label: str) -> Iterator[ProgressCall]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def table(head: list[str], rows: list[list[str]]) -> list[str]:
-    """Lines of a table, the first column to the left and the others to the right."""
-    return as_text([Table(tuple(head), tuple(map(tuple, rows)))], sys.maxsize)
+def say_table(head: list[str], rows: list[list[str]]) -> None:
+    """A table of the result, on stdout, the first column to the left and the others to the right."""
+    for line in as_text([Table(tuple(head), tuple(map(tuple, rows)))], sys.maxsize):
+        say(line)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, say, table
+from calib.cli.common import JsonOption, document, narrate, say, say_table
 from calib.core.words import number
 
 if TYPE_CHECKING:
@@ -60,8 +60,7 @@ def _tell(found: RigDiff, every: bool) -> None:
     say(f"{found.compared} constants are in both, {len(both)} of them differ")
     rows = [_row(change) for change in (both if every else both[:_SHOWN])]
     if rows:
-        for line in table(["constant", "before", "after", "difference", "unit", "in sigma", ""], rows):
-            say(line)
+        say_table(["constant", "before", "after", "difference", "unit", "in sigma", ""], rows)
     if len(rows) < len(both):
         say(f"  {len(both) - len(rows)} more (--all shows them)")
     alone = [

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, say, table
+from calib.cli.common import JsonOption, document, say, say_table
 from calib.core.errors import EXIT_POOR
 
 
@@ -26,20 +26,14 @@ def doctor(
     checks = examine(quick)
     bad = [check for check in checks if check.needed and not check.good]
     if as_json:
-        document(
-            "doctor",
-            {
-                "checks": [asdict(check) for check in checks],
-                "gate": [c.name for c in bad] or "passed",
-            },
-        )
+        gate = [c.name for c in bad] or "passed"
+        document("doctor", {"checks": [asdict(check) for check in checks], "gate": gate})
     else:
         rows = [
             [c.name, "ok" if c.good else "MISSING" if c.needed else "not there", c.found, c.what_for]
             for c in checks
         ]
-        for line in table(["", "", "found", "for"], rows):
-            say(line)
+        say_table(["", "", "found", "for"], rows)
         say(f"verdict: {'poor, ' + ', '.join(c.name for c in bad) if bad else 'ok'}")
     if bad:
         raise typer.Exit(EXIT_POOR)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say, say_table
 from calib.core.errors import EXIT_POOR, UsageError
 from calib.core.files import shown
 from calib.core.units import parse_duration_s
@@ -192,8 +192,7 @@ def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
                 ]
             )
     if rows:
-        for line in table(["constant", "median", "spread", "outliers", "drift per number"], rows):
-            say(line)
+        say_table(["constant", "median", "spread", "outliers", "drift per number"], rows)
     for look in summary.looks[:_MOST_TOLD]:
         say(f"look at {look.name}: {look.verdict}{', ' if look.why else ''}{look.why}")
     if summary.to_look_at > _MOST_TOLD:
@@ -262,8 +261,7 @@ def _tell_sweep(summary: SweepSummary) -> None:
             ]
             for point in points
         ]
-        for line in table(head, rows):
-            say(line)
+        say_table(head, rows)
 
 
 def _text(value: Any) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, say
+from calib.cli.common import JsonOption, document, narrate, refuse_recorded, say
 from calib.core.errors import BadInputError, UsageError, pip_install
 from calib.core.files import shown
 from calib.core.units import parse_duration_s
@@ -120,7 +120,7 @@ def _experiments(
         if plans:
             make_folder(output / "logs")
     else:
-        _must_be_new(output)
+        refuse_recorded(output)
         check_writable(output, LOG)
         plans = [(do, output)]
     results: list[dict[str, Any]] = []
@@ -206,13 +206,6 @@ def _complete(path: Path, seconds: float) -> bool:
     return True
 
 
-def _must_be_new(output: Path) -> None:
-    if output.is_file() and output.stat().st_size:
-        raise BadInputError(
-            f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"
-        )
-
-
 def _ticks(
     port: str, output: Path, duration_s: float | None, ticks: int | None, baud: int, as_json: bool
 ) -> None:
@@ -220,7 +213,7 @@ def _ticks(
     from calib.io.serial import ALIVE
     from calib.io.serial import record as run
 
-    _must_be_new(output)
+    refuse_recorded(output)
     check_writable(output, LOG)
     line = _Port(port, baud)
     began = said = time.monotonic()

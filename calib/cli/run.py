@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, progress_bar, say, table
+from calib.cli.common import JsonOption, document, narrate, progress_bar, say, say_table
 from calib.cli.verbs import of_logs
 from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
@@ -74,6 +74,5 @@ def run(
 
 def _tell(ended: Sequence[Job], files: Sequence[str], output: Path) -> None:
     rows = [[job.label, job.status, "as before" if job.reused else ""] for job in ended]
-    for line in table(["stage", "", ""], rows):
-        say(line)
+    say_table(["stage", "", ""], rows)
     say(f"{shown(output)}: report.html and {len(files) - 1} more files")

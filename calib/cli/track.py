@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, say
+from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, refuse_recorded, say
 from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError
 from calib.core.files import shown
 from calib.core.units import parse_duration_s, parse_length_m, parse_pixel
-from calib.core.writing import Kind, check_writable, column_names, write_atomically
+from calib.core.writing import check_writable, write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,6 +70,7 @@ def track(
     """
     from calib.io.frames import timed_frames
     from calib.stages.camera.marker import (
+        TRACK,
         TRACK_COLUMNS,
         Colour,
         Tracker,
@@ -79,7 +80,6 @@ def track(
         track_text,
     )
 
-    kind = Kind("a track", (".csv",), lambda path: tuple(column_names(path)) == TRACK_COLUMNS)
     start = None if at is None else parse_pixel(at, "--at")
     limit_s = None if duration is None else parse_duration_s(duration, "--duration")
     wanted = None if colour is None else parse_colour(colour)
@@ -87,12 +87,10 @@ def track(
         raise UsageError("--diameter: does not go with --pixy, which tells the middle of the blob's box")
     disc = None if diameter is None else _DiscOnPlane.of(rig, parse_length_m(diameter, "--diameter"))
     where = int(source) if source.isdecimal() else source if "://" in source else Path(source)
-    check_writable(output, kind)
+    check_writable(output, TRACK)
     times, frames = timed_frames(where)
-    if times.arrival and output.is_file() and output.stat().st_size:
-        raise BadInputError(
-            f"{shown(output)}: is there, and a recording cannot be made again; give another name, or move it"
-        )
+    if times.arrival:
+        refuse_recorded(output)
     if times.arrival and limit_s is None:
         narrate("following the marker; Ctrl-C ends it")
     tracker: Tracker | None = None
@@ -132,7 +130,7 @@ def track(
     if disc is not None:
         disc.refuse_size([one for one in found if one is not None])
     rows = track_rows(times.settled_s(), found, pixy, None if disc is None else disc.centre)
-    write_atomically(output, f"{','.join(TRACK_COLUMNS)}\n{track_text(rows, pixy)}", kind)
+    write_atomically(output, f"{','.join(TRACK_COLUMNS)}\n{track_text(rows, pixy)}", TRACK)
     told: dict[str, Any] = {
         "frames": len(found),
         "found": seen,

@@ -27,13 +27,14 @@ class CalibError(Exception):
 
     def __init__(self, message: str = "") -> None:
         # A cell or a key that is quoted may hold what moves a terminal's cursor.
-        super().__init__("".join(_visible(c) for c in message) if not message.isprintable() else message)
+        super().__init__(one_line(message))
 
 
-def _visible(character: str) -> str:
-    if character.isprintable():
-        return character
-    return character.encode("unicode_escape").decode("ascii")
+def one_line(text: str) -> str:
+    """Text as a terminal may get it: line breaks and other control characters escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 class BadInputError(CalibError):

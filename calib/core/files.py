@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from calib.core.command import note_inputs
 from calib.core.errors import BadInputError
+from calib.core.errors import one_line as one_line
 
 _MAX_BYTES = 500_000_000
 PICTURES = (
@@ -22,13 +24,6 @@ BAGS = (".bag", ".db3", ".mcap")
 _MAX_YAML_BYTES = 1_000_000
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789-_.")
 _LONGEST = 80
-
-
-def one_line(text: str) -> str:
-    """Text as a terminal may get it: line breaks and other control characters escaped."""
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def quoted(value: Any) -> str:
@@ -69,11 +64,18 @@ def check_readable(path: Path) -> int:
     return size
 
 
-def _size(path: Path) -> int:
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Raise `BadInputError` for what the system says against reading a file."""
     try:
-        status = path.stat()
+        yield
     except OSError as error:
         raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+
+
+def _size(path: Path) -> int:
+    with reading(path):
+        status = path.stat()
     if stat.S_ISDIR(status.st_mode):
         raise BadInputError(f"{shown(path)}: is a folder, expected a file")
     if not stat.S_ISREG(status.st_mode):
@@ -86,11 +88,8 @@ def read_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
     size = check_readable(path)
     data = b""
     if size <= most:
-        try:
-            with path.open("rb") as stream:
-                data = stream.read(most + 1)
-        except OSError as error:
-            raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+        with reading(path), path.open("rb") as stream:
+            data = stream.read(most + 1)
     if max(size, len(data)) > most:
         raise BadInputError(f"{shown(path)}: is larger than {most / 1e6:g} MB")
     return data
@@ -117,11 +116,8 @@ def sha256(data: bytes) -> str:
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file of any size in hexadecimal, or a `BadInputError` that says why not."""
     _size(path)
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    with reading(path), path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def hash_of(path: Path) -> str:

@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, shown
-from calib.core.units import unit_of
+from calib.core.units import plain_number, unit_of
 
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -126,7 +126,7 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
     elif how in _OUT_OF_RANGE and isinstance(value, int | float):
         expected = _range(part, _unit(place), value)
         return f"{key} is {value:g}, expected {expected}"
-    elif how in ("float_type", "int_type") and isinstance(value, str) and _reads_as_number(value):
+    elif how in ("float_type", "int_type") and isinstance(value, str) and plain_number(value) is not None:
         expected += " (without quotes, and in YAML an exponent needs a point and a sign, as 2.0e-2)"
     elif how == "float_type" and _unit(place):
         expected += f" ({_unit(place)})"
@@ -191,11 +191,3 @@ def _kinds(part: Any, whole: dict[str, Any]) -> list[dict[str, Any]]:
     if several := part.get("anyOf") or part.get("oneOf"):
         return [kind for one in several if one.get("type") != "null" for kind in _kinds(one, whole)]
     return [part]
-
-
-def _reads_as_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -141,11 +141,6 @@ class Output:
     kind: Callable[[], Kind] | None = None
 
 
-def _no_evidence(outcome: Any) -> dict[str, Any]:
-    del outcome
-    return {}
-
-
 def _parts(outcome: Any) -> tuple[Result | None, ...]:
     return outcome if isinstance(outcome, tuple) else (outcome,)
 
@@ -188,7 +183,7 @@ class Stage:
     needs: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     output: Output | None = None
-    document: Callable[[Any], dict[str, Any]] = _no_evidence
+    document: Callable[[Any], dict[str, Any]] = lambda outcome: {}
     words: Callable[[Any], Sequence[Block]] | None = None
     plots: Callable[[Any], dict[str, Figure]] | None = None
     remarks: Callable[[Rig], Sequence[str]] | None = None

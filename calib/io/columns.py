@@ -148,20 +148,19 @@ _MOST_EVIDENCE = 100_000
 
 def kind_of(column: str) -> str:
     """The kind of a column of `COLUMNS` or of `t_s`, a key of `UNITS`; empty for quaternions and truth."""
-    if column == "t_s":
-        return "time"
-    kinds: dict[str, tuple[str, ...]] = {
-        "accel": ACCEL,
-        "gyro": GYRO,
-        "pixel": MEASURED[:2],
-        "pwm": PWM,
-        "pressure": (*COMMANDED, *PRESSURES),
-        "length": POSITION,
-    }
-    for kind, names in kinds.items():
-        if column in names:
-            return kind
-    return "angle" if column in ("onchip_phi_rad", "tip_phi_rad") else ""
+    return _KIND.get(column, "")
+
+
+_KIND = {
+    "t_s": "time",
+    **dict.fromkeys(ACCEL, "accel"),
+    **dict.fromkeys(GYRO, "gyro"),
+    **dict.fromkeys(("onchip_phi_rad", "tip_phi_rad"), "angle"),
+    **dict.fromkeys(MEASURED[:2], "pixel"),
+    **dict.fromkeys(PWM, "pwm"),
+    **dict.fromkeys((*COMMANDED, *PRESSURES), "pressure"),
+    **dict.fromkeys(POSITION, "length"),
+}
 
 
 def is_arm_log(names: Sequence[str]) -> bool:
@@ -258,23 +257,19 @@ class Passed:
     @property
     def sentences(self) -> list[str]:
         """One for each kind that there is."""
-        beyond = f"{self.beyond} cells hold more than any sensor gives ({self.first}) and count as blank"
-        clipped = (
-            f"{self.clipped} readings are at the end of a sensor's range ({self.end}) and count as blank"
-        )
-        outside = f"{self.outside} pictures put the marker outside the picture and count as blank"
-        return [
-            *([f"{self.not_finite} cells say nan or inf and count as blank"] if self.not_finite else []),
-            *([beyond] if self.beyond else []),
-            *([outside] if self.outside else []),
-            *([clipped] if self.clipped else []),
-            *(["the last line is cut short and left out"] if self.truncated else []),
-            *(
-                [f"the time is a counter that begins again {self.wraps} times, and is counted on"]
-                if self.wraps
-                else []
+        blank = "and count as blank"
+        kinds = (
+            (self.not_finite, f"{self.not_finite} cells say nan or inf {blank}"),
+            (self.beyond, f"{self.beyond} cells hold more than any sensor gives ({self.first}) {blank}"),
+            (self.outside, f"{self.outside} pictures put the marker outside the picture {blank}"),
+            (
+                self.clipped,
+                f"{self.clipped} readings are at the end of a sensor's range ({self.end}) {blank}",
             ),
-        ]
+            (self.truncated, "the last line is cut short and left out"),
+            (self.wraps, f"the time is a counter that begins again {self.wraps} times, and is counted on"),
+        )
+        return [sentence for there, sentence in kinds if there]
 
 
 ALL_TAKEN = Passed()
@@ -331,6 +326,12 @@ def find_columns(log: Path) -> Path | None:
     """The columns.yaml of a log, None without."""
     places = (log.with_name(f"{log.stem}.columns.yaml"), log.with_name("columns.yaml"))
     return next((place for place in places if place.is_file()), None)
+
+
+def columns_file(log: Path, options: LogOptions) -> ColumnsFile | None:
+    """The columns.yaml that is stated for a log, or else lies beside it; None without."""
+    place = options.columns or find_columns(log)
+    return None if place is None else read_columns_file(place)
 
 
 def read_columns_file(path: Path) -> ColumnsFile:

@@ -30,7 +30,7 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
-from calib.core.files import check_readable, is_bag, shown
+from calib.core.files import check_readable, is_bag, reading, shown
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
@@ -47,9 +47,9 @@ from calib.io.columns import (
     ColumnMap,
     Passed,
     column_map,
+    columns_file,
     find_columns,
     kind_of,
-    read_columns_file,
     settled,
     turning,
 )
@@ -111,11 +111,52 @@ class Log:
     def signals(
         self, *names: str, optional: Sequence[str] = (), counts: bool = False, partly: bool = False
     ) -> Signals:
-        """Readings of these columns and of those optional ones that the log has.
+        """Readings of these columns and of those optional ones that have any.
 
-        Raises `BadInputError` as `signals_of`.
+        Parameters
+        ----------
+        counts : take columns in counts as they are.
+        partly : take rows with a reading in any of the columns, not in all of them.
+
+        Raises
+        ------
+        BadInputError for columns in counts otherwise, for time that goes back, for a column that is not there
+        or holds no number, and for columns that never have a reading in the same row.
         """
-        return signals_of(self, names, tuple(optional), counts, partly)
+        lacking = [name for name in names if name not in self.columns]
+        if lacking:
+            has = f"has no {_listed(lacking)}, expected {_listed(names)} beside t_s"
+            raise BadInputError(f"{self.source}: {has}")
+        blank = [name for name in names if np.isnan(self.columns[name]).all()]
+        if blank:
+            raise BadInputError(f"{self.source}: {_listed(blank)} hold{'s' * (len(blank) == 1)} no number")
+        others = [name for name in optional if name in self.columns and name not in names]
+        wanted = (*names, *(name for name in others if np.isfinite(self.columns[name]).any()))
+        if not wanted:
+            raise BadInputError(f"{self.source}: has no reading of {_listed(optional)}")
+        if not counts:
+            refuse_counts(self, wanted)
+        check_time(self)
+        apart = None if partly else _apart(self, wanted)
+        log = self if apart is None else apart
+        rows = log.sampled(*wanted) if not partly else _any(log, wanted)
+        if len(rows) == 0:
+            raise BadInputError(
+                f"{log.source}: no row has all of {', '.join(wanted)}, expected them together"
+            )
+        watch = Watch(tuple(name for name in (*names, *optional) if name in IMU))
+        watch.add(log)
+        for a, b in watch.held:
+            rows = rows[(rows < a) | (rows >= b)]
+        values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
+        stamps = log.t_s[rows]
+        same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
+        twice = (np.diff(stamps) == 0.0) & same
+        if twice.any():
+            kept = np.concatenate([[True], ~twice])
+            rows, stamps, values = rows[kept], stamps[kept], values[kept]
+        findings = (*watch.findings(stuck=False), *([_APART] if apart is not None else []))
+        return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
 
     def remarks(self) -> list[str]:
         """Sentences on what the columns were read as, and on what was not taken as it stands."""
@@ -255,11 +296,8 @@ def iter_rows(
 
 
 def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
-    try:
-        with open_text(path) as stream:
-            yield from iter_rows(stream, shown(path), path, options)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    with reading(path), open_text(path) as stream:
+        yield from iter_rows(stream, shown(path), path, options)
 
 
 def _iter_bag(path: Path, options: LogOptions) -> Iterator[Log]:
@@ -268,14 +306,8 @@ def _iter_bag(path: Path, options: LogOptions) -> Iterator[Log]:
 
     with bag_blocks(path, options.topics) as (left_out, blocks):
         first = next(blocks)
-        columns = _stated(shown(path), path, tuple(first.cells), options)
+        columns = column_map(shown(path), path, 1, tuple(first.cells), columns_file(path, options), options)
         yield from (replace(log, unknown=left_out) for log in _logs(columns, chain([first], blocks)))
-
-
-def _stated(source: str, path: Path, names: Sequence[str], options: LogOptions) -> ColumnMap:
-    """What columns `names` of a file that is no table are."""
-    given = options.columns or find_columns(path)
-    return column_map(source, path, 1, names, None if given is None else read_columns_file(given), options)
 
 
 def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: LogOptions) -> Log:
@@ -283,7 +315,7 @@ def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: Lo
 
     Raises `BadInputError` for units that contradict the readings.
     """
-    columns = _stated(source, path, tuple(cells), options)
+    columns = column_map(source, path, 1, tuple(cells), columns_file(path, options), options)
     lines = np.arange(1, len(cells["t_s"]) + 1, dtype=np.int64)
     (log,) = _logs(columns, iter([Block(cells, lines)]))
     return within(log)
@@ -552,54 +584,6 @@ def refuse_counts(log: Log, names: Sequence[str]) -> None:
                 f"{log.source}: {name} is in counts, expected a unit; calib imu intrinsics finds the scale: "
                 f"add it to {log.map.folder}, such as {name}: {{column: {column}, factor: 0.0024}}"
             )
-
-
-def signals_of(
-    log: Log, names: Sequence[str], optional: Sequence[str], counts: bool, partly: bool
-) -> Signals:
-    """Readings of the columns `names`, and of those optional ones that have any.
-
-    Parameters
-    ----------
-    counts : take columns in counts as they are.
-    partly : take rows with a reading in any of the columns, not in all of them.
-
-    Raises
-    ------
-    BadInputError for columns in counts otherwise, for time that goes back, for a column that is not there or
-    holds no number, and for columns that never have a reading in the same row.
-    """
-    lacking = [name for name in names if name not in log.columns]
-    if lacking:
-        raise BadInputError(f"{log.source}: has no {_listed(lacking)}, expected {_listed(names)} beside t_s")
-    blank = [name for name in names if np.isnan(log.columns[name]).all()]
-    if blank:
-        raise BadInputError(f"{log.source}: {_listed(blank)} hold{'s' * (len(blank) == 1)} no number")
-    more = [n for n in optional if n in log.columns and n not in names and np.isfinite(log.columns[n]).any()]
-    wanted = (*names, *more)
-    if not wanted:
-        raise BadInputError(f"{log.source}: has no reading of {_listed(optional)}")
-    if not counts:
-        refuse_counts(log, wanted)
-    check_time(log)
-    apart = None if partly else _apart(log, wanted)
-    log = log if apart is None else apart
-    rows = log.sampled(*wanted) if not partly else _any(log, wanted)
-    if len(rows) == 0:
-        raise BadInputError(f"{log.source}: no row has all of {', '.join(wanted)}, expected them together")
-    watch = Watch(tuple(name for name in (*names, *optional) if name in IMU))
-    watch.add(log)
-    for a, b in watch.held:
-        rows = rows[(rows < a) | (rows >= b)]
-    values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
-    stamps = log.t_s[rows]
-    same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
-    twice = (np.diff(stamps) == 0.0) & same
-    if twice.any():
-        kept = np.concatenate([[True], ~twice])
-        rows, stamps, values = rows[kept], stamps[kept], values[kept]
-    findings = (*watch.findings(stuck=False), *([_APART] if apart is not None else []))
-    return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
 
 
 _APART = Finding(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import struct
 from binascii import crc_hqx
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import BadInputError
-from calib.core.files import check_readable, shown
+from calib.core.files import read_bytes, shown
 
 # ----------------------------------------------------------------------
 # Frames between computer and board, see `calib_link.h`:
@@ -527,11 +528,7 @@ _MOST_BYTES = 1 << 28
 
 def stream_text(path: Path) -> str:
     """The log as CSV. Raises `BadInputError` for a file without a frame, or one that is too large."""
-
-    size = check_readable(path)
-    if size > _MOST_BYTES:
-        raise BadInputError(f"{shown(path)}: is larger than {_MOST_BYTES / 1e6:g} MB")
-    ended = False
+    stream, ended = io.BytesIO(read_bytes(path, _MOST_BYTES)), False
     logs: dict[int, list[str]] = {}
 
     def read() -> bytes:
@@ -540,13 +537,7 @@ def stream_text(path: Path) -> str:
         ended = not data
         return data
 
-    try:
-        with path.open("rb") as stream:
-            result = record(
-                read, lambda ticks: not ended, lambda run, text: logs.setdefault(run, []).append(text)
-            )
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    result = record(read, lambda ticks: not ended, lambda run, text: logs.setdefault(run, []).append(text))
     if not ended:
         # For a port Ctrl-C is the end of the log; of a file it would be half.
         raise KeyboardInterrupt

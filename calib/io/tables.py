@@ -30,9 +30,8 @@ from calib.io.columns import (
     ColumnsFile,
     Passed,
     column_map,
-    find_columns,
+    columns_file,
     known_name,
-    read_columns_file,
 )
 
 _BLOCK_BYTES = 1 << 20
@@ -224,8 +223,7 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
 
     The header is the first line that is neither blank nor a comment.
     """
-    given = options.columns or find_columns(path)
-    file = None if given is None else read_columns_file(given)
+    file = columns_file(path, options)
     line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
     while raw.endswith(b"\n") and (not raw.strip() or raw.lstrip(b"\xef\xbb\xbf").startswith(b"#")):
         comment = raw.decode("utf-8-sig", "replace").lstrip("#% ").rstrip("\r\n") or comment
@@ -393,8 +391,7 @@ def parquet_blocks(path: Path, options: LogOptions) -> tuple[ColumnMap, Iterator
     import pyarrow
     from pyarrow import parquet
 
-    given = options.columns or find_columns(path)
-    named = read_columns_file(given) if given is not None else None
+    named = columns_file(path, options)
     with _parquet_errors(shown(path)):
         file = parquet.ParquetFile(path, pre_buffer=False)
         columns = column_map(shown(path), path, 1, file.schema_arrow.names, named, options)

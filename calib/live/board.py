@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import BadInputError
+from calib.core.units import plain_number
 from calib.io.experiments import EXPERIMENTS
 from calib.live.album import Album
 
@@ -104,24 +105,22 @@ class Board:
     def ended(self) -> bool:
         """Whether the recording at hand has come to its end; what it said is kept then."""
         with self._lock:
-            return self._ended()
-
-    def _ended(self) -> bool:
-        process = self._process
-        if process is None or process.poll() is None:
-            return False
-        out, said = process.communicate()
-        self._more()
-        if process.returncode == 0 and self.path is not None:
-            logs = json.loads(out)["record"]["logs"]
-            self.last = "; ".join(f"{one['ticks']} ticks in {one['log']}, {one['lost']} lost" for one in logs)
-            self.done.append(self.path.name)
-        else:
-            lines = [line.removeprefix("calib: ") for line in said.strip().splitlines() if line]
-            self.last = (lines or ["the recording ended without a word"])[-1][:_MOST_WORDS]
-        # Whoever sees that it is over finds what it said.
-        self._process = None
-        return True
+            process = self._process
+            if process is None or process.poll() is None:
+                return False
+            out, said = process.communicate()
+            self._more()
+            if process.returncode == 0 and self.path is not None:
+                logs = json.loads(out)["record"]["logs"]
+                told = (f"{one['ticks']} ticks in {one['log']}, {one['lost']} lost" for one in logs)
+                self.last = "; ".join(told)
+                self.done.append(self.path.name)
+            else:
+                lines = [line.removeprefix("calib: ") for line in said.strip().splitlines() if line]
+                self.last = (lines or ["the recording ended without a word"])[-1][:_MOST_WORDS]
+            # Whoever sees that it is over finds what it said.
+            self._process = None
+            return True
 
     def _more(self) -> None:
         """Rows that the log has got since it was last read."""
@@ -141,12 +140,9 @@ class Board:
     def shown(self) -> dict[str, Any]:
         """State for a page, as JSON takes it."""
         with self._lock:
-            return self._shown()
-
-    def _shown(self) -> dict[str, Any]:
-        self._more()
-        at = {name: k for k, name in enumerate(self._heads)}
-        rows = list(self._rows)
+            self._more()
+            at, rows = {name: k for k, name in enumerate(self._heads)}, list(self._rows)
+            recording = self.path.name if self.path is not None and self.at_work else None
         end = rows[-1][at["t_s"]] if rows and "t_s" in at else None
         if end is not None:
             rows = [row for row in rows if (row[at["t_s"]] or 0.0) >= end - _PLOTTED_S]
@@ -163,7 +159,7 @@ class Board:
         return {
             "port": self.port,
             "programme": [[name, _duration(name), what] for name, what in PROGRAMME.items()],
-            "recording": self.path.name if self.path is not None and self.at_work else None,
+            "recording": recording,
             "seconds": None if end is None else round(end, 1),
             "last": self.last,
             "done": self.done,
@@ -172,8 +168,5 @@ class Board:
 
 
 def _number(cell: str) -> float | None:
-    try:
-        value = float(cell)
-    except ValueError:
-        return None
-    return value if abs(value) < 1e12 else None
+    value = plain_number(cell)
+    return value if value is not None and abs(value) < 1e12 else None

@@ -12,10 +12,11 @@ import numpy as np
 from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import shown
-from calib.core.writing import Kind, appending, column_names, write_atomically
+from calib.core.writing import appending, write_atomically
 from calib.io.frames import Times
 from calib.live.album import Album
 from calib.stages.camera.marker import (
+    TRACK,
     TRACK_COLUMNS,
     Colour,
     Disc,
@@ -27,7 +28,6 @@ from calib.stages.camera.marker import (
 )
 
 _HEAD = ",".join(TRACK_COLUMNS) + "\n"
-_TRACK = Kind("a track", (".csv",), lambda path: tuple(column_names(path)) == TRACK_COLUMNS)
 _MOST_FRAMES = 500_000
 """Of one recording: more than two hours at 60 frames a second."""
 _PLOTTED_S = 20.0
@@ -101,7 +101,7 @@ class Marker:
         """Record from the next frame on. Raises `BadInputError` where nothing can be written."""
         self._only_between()
         self.path = self.album.new_log("track")
-        self._stream = appending(self.path, _TRACK)
+        self._stream = appending(self.path, TRACK)
         self._stream.write(_HEAD.encode())
         self._times, self._discs = Times(arrival=True, rate_hz=0.0), []
         self.tracker = Tracker(self.colour) if self.tracker is None else self.tracker
@@ -130,7 +130,7 @@ class Marker:
             self.path.unlink(missing_ok=True)
             self.last = "nothing was recorded: the marker was not seen"
             return
-        write_atomically(self.path, _HEAD + track_text(rows), _TRACK)
+        write_atomically(self.path, _HEAD + track_text(rows), TRACK)
         seen = f"marker in {len(rows)} of {len(self._discs)} frames, written to {shown(self.path)}"
         sigma = float(np.median([row[3] for row in rows]))
         self.last = f"{seen}; sigma of the centre {sigma:.2f} px; {self._times.words()}"

@@ -14,7 +14,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.live.session import Seen, Session
+from calib.live.session import Seen, Session, foremost
 from calib.stages.camera.corners import detect
 from calib.stages.camera.model import Board
 from calib.stages.camera.plane import settle_orientation, turns_of
@@ -142,10 +142,9 @@ def _result(plane: Plane, camera: Camera, rig: Rig) -> dict[str, Any]:
     x0, y0, x1, y1 = rig.workspace_m
     box = plane.to_pixels([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], camera)
     axes = plane.to_pixels([[0.0, 0.0], [_AXIS_M, 0.0], [0.0, _AXIS_M]], camera)
-    verdict = plane.verdict
     return {
-        "verdict": verdict.word,
-        "reasons": [*rig.outdated(), *verdict.reasons[:3], *([] if verdict.ok else verdict.advice[:1])],
+        "verdict": plane.verdict.word,
+        "reasons": [*rig.outdated(), *foremost(plane.verdict)],
         "rms_mm": plane.rms_mm,
         "sigma_mm": plane.sigma_marker_mm.get("calibration_max"),
         "axes": [None if not np.isfinite(one).all() else np.round(one, 1).tolist() for one in axes],

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from calib.core.arrays import FloatArray, GrayImage
+from calib.core.verdict import Verdict
 from calib.stages.camera.bundle import poses_with_camera, projection_sigma_px
 from calib.stages.camera.checks import (
     Candidate,
@@ -413,9 +414,7 @@ class Session:
             ],
             "fx_px": None if fit is None else _number(fit.calibration.camera.fx_px),
             "verdict": "none yet" if verdict is None else verdict.word,
-            "reasons": []
-            if verdict is None
-            else [*verdict.reasons[:3], *([] if verdict.ok else verdict.advice[:1])],
+            "reasons": [] if verdict is None else foremost(verdict),
             "gain": _number(gain),
             "enough": self.enough,
             "ghost": {
@@ -510,6 +509,11 @@ def _outer(grid: FloatArray) -> FloatArray:
 
 def _diagonal(box: FloatArray) -> float:
     return float(np.linalg.norm(box[2] - box[0]) + np.linalg.norm(box[3] - box[1]))
+
+
+def foremost(verdict: Verdict) -> list[str]:
+    """The sentences of a verdict that a page has room for."""
+    return [*verdict.reasons[:3], *([] if verdict.ok else verdict.advice[:1])]
 
 
 def _number(value: float | None) -> float | None:

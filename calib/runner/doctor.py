@@ -64,7 +64,7 @@ def examine(quick: bool = False) -> list[Check]:
     """Look at everything; the trial, which takes a few seconds, is left out of a quick look."""
     libraries = list(_libraries())
     checks = [
-        _python(),
+        Check("Python", True, sys.version_info >= _LEAST_PYTHON, platform.python_version(), "at least 3.11"),
         *(one for one in libraries if one.needed),
         _tried("folder for temporary files", _folder),
     ]
@@ -74,12 +74,6 @@ def examine(quick: bool = False) -> list[Check]:
     checks += [one for one in libraries if not one.needed]
     checks += [_tool(names, what_for) for names, what_for in _TOOLS]
     return checks
-
-
-def _python() -> Check:
-    return Check(
-        "Python", True, sys.version_info >= _LEAST_PYTHON, platform.python_version(), "at least 3.11"
-    )
 
 
 def _numbers(version: str) -> tuple[int, ...]:

@@ -768,8 +768,6 @@ def limit_of(rigs: int, constants: int) -> float:
 
 _HUBER = 1.345
 _STEPS = 200
-_DRIFT_CHANCE = 0.05
-_DRIFT_TO_SIGMA = 1.482602218505602
 
 
 @dataclass(frozen=True)
@@ -840,7 +838,7 @@ def drift_of(serial: FloatArray, x: FloatArray, sigma: FloatArray, spread: Sprea
 def _scale(r: FloatArray) -> float:
     """Robust standard deviation of residuals about zero; two of them are spent on the line."""
     ordered = np.sort(np.abs(r))
-    return _DRIFT_TO_SIGMA * float(np.median(ordered[2:] if len(ordered) > 4 else ordered))
+    return _TO_SIGMA * float(np.median(ordered[2:] if len(ordered) > 4 else ordered))
 
 
 def _covariance(X: FloatArray, r: FloatArray, s: float) -> FloatArray | None:
@@ -861,7 +859,7 @@ def drift_limit(rigs: int, constants: int) -> float:
     """|slope| over its sigma beyond which a constant drifts, by chance in 5 % of all fleets."""
     from scipy.special import stdtrit
 
-    return -float(stdtrit(max(rigs - 2, 1), 0.5 * _DRIFT_CHANCE / max(constants, 1)))
+    return -float(stdtrit(max(rigs - 2, 1), 0.5 * _CHANCE / max(constants, 1)))
 
 
 # ----------------------------------------------------------------------

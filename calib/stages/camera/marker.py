@@ -27,6 +27,7 @@ import numpy as np
 
 from calib.core.arrays import AnyArray, BoolArray, FloatArray
 from calib.core.errors import UsageError
+from calib.core.writing import Kind, column_names
 
 COLOURS = {
     "red": 0.0, "orange": 24.0, "yellow": 55.0, "green": 120.0, "cyan": 185.0, "blue": 220.0, "purple": 280.0,
@@ -417,6 +418,7 @@ class Tracker:
 
 
 TRACK_COLUMNS = ("t_s", "u_px", "v_px", "sigma_px")
+TRACK = Kind("a track", (".csv",), lambda path: column_names(path) == TRACK_COLUMNS)
 """Of the log that a track is written as."""
 
 
