@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -34,3 +35,13 @@ def integral(t: FloatArray, values: FloatArray) -> FloatArray:
     """
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)
     return np.asarray(np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of values of any shape; NaN for none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
+
+
+def robust_sigma(values: FloatArray) -> float:
+    """Standard deviation about zero of values (n,), by their median size: 1.4826 times it for normal ones."""
+    return 1.4826 * float(np.median(np.abs(values)))

@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray, blocks
+from calib.core.arrays import FloatArray, IntArray, blocks, rms
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.options import LogOptions
@@ -732,8 +732,8 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
         turn3 = np.diff(np.add.reduceat(np.cumsum(steps, axis=0), edges, axis=0)[: len(edges)] / size, axis=0)
         turned = np.linalg.norm(np.diff(means3, axis=0), axis=1)
         misfit = {f: np.linalg.norm(means3[1:] - _turned(means3[:-1], -f * turn3), axis=1) for f in factors}
-    whole = float(np.sqrt(np.mean(turned**2))) if len(turned) else 0.0
-    share = {f: float(np.sqrt(np.mean(off**2))) / whole if whole > 0.0 else 1.0 for f, off in misfit.items()}
+    whole = rms(turned) if len(turned) else 0.0
+    share = {f: rms(off) / whole if whole > 0.0 else 1.0 for f, off in misfit.items()}
     spread = float(phi.std()) if flat else float(np.linalg.norm(unit.std(axis=0)))
     return Turning(flat, by_force, by_gyro, spread, share, whole)
 

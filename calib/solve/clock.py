@@ -34,7 +34,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, robust_sigma
 
 SPLIT_S = 1.0
 """Gaps that are longer are not filled."""
@@ -185,7 +185,7 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
         within = np.delete(steps, starts[1:] - 1)
         weighted, samples = float(within.sum()), len(within)
     period = weighted / samples if weighted > 0.0 else math.nan
-    jitter = 1.4826 * float(np.median(np.abs(t - times))) if len(t) else 0.0
+    jitter = robust_sigma(t - times) if len(t) else 0.0
     return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()))
 
 
@@ -292,7 +292,7 @@ def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
         period = float(apart @ (t[use] - at) / max(float(apart @ apart), 1e-300))
         origin = at - period * middle
         off = t - origin - period * k
-        spread = max(1.4826 * float(np.median(np.abs(off[use]))), 1e-7)
+        spread = max(robust_sigma(off[use]), 1e-7)
         again = np.abs(off) <= _FAR * spread
         if again.sum() < _LEAST_SAMPLES // 2 or np.array_equal(again, use):
             break
@@ -358,7 +358,7 @@ def _without_steps(k: FloatArray, off: FloatArray) -> FloatArray:
     Where its jitter is small, what a clock wanders is followed closely enough to hide such steps.
     """
     middle, half = _running_median(off), _WINDOW // 2
-    spread = 1.4826 * float(np.median(np.abs(off - middle)))
+    spread = robust_sigma(off - middle)
     if len(k) < 2 * _WINDOW or _FAR * spread > 0.5:
         return k
     medians = middle[half:-half]
@@ -385,7 +385,7 @@ def _wander(even: FloatArray, off: FloatArray) -> FloatArray:
     # At its ends the running median lags behind a slope.
     trend = slope / lag * np.arange(len(off))
     middle = trend + _running_median(off - trend)
-    spread = 1.4826 * float(np.median(np.abs(off - middle)))
+    spread = robust_sigma(off - middle)
     most = _FAR * spread + _WINDOW / lag * float(np.median(np.abs(ahead - slope)))
     off = np.clip(off, middle - most, middle + most)
     best, least, by, jitter, wanders = 1, math.inf, off, 0.0, False

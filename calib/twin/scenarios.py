@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, rms
 from calib.core.errors import BadInputError, UsageError
 from calib.core.result import Section
 from calib.core.rig import Rig
@@ -419,8 +419,8 @@ class EllipseTrack(Scenario):
         if not len(error):
             return {}
         return {
-            "rms_error_q1_mm": float(np.sqrt(np.mean(error[:, 0] ** 2))),
-            "rms_error_q2_mm": float(np.sqrt(np.mean(error[:, 1] ** 2))),
+            "rms_error_q1_mm": rms(error[:, 0]),
+            "rms_error_q2_mm": rms(error[:, 1]),
         }
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, rms, robust_sigma
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
 from calib.solve.groups import tied_groups
@@ -1014,7 +1014,7 @@ def _without_creep(solution: Solution) -> Solution:
     usual = found(known[spring], {name: f"{damping} {known[name]:.4g}" for name in (rate, spring)})
     least = PARAMETERS[spring].low
     none = found(least, {spring: f"the logs show {NO_CREEP}; kept at {least:g}"})
-    scale = 1.4826 * float(np.median(np.abs(none.residual)))
+    scale = robust_sigma(none.residual)
     contradicted = usual.cost - none.cost > 0.5 * (_CONTRARY * scale) ** 2
     plainer = none if contradicted else usual
     return plainer if plainer.cost < _alike(solution.cost) else solution
@@ -1136,7 +1136,7 @@ def uncertainty(solution: Solution) -> Uncertainty:
     w = weights(problem, r)
     spans = problem.spans
     rows = spans[-1].stop
-    scale = max(1.4826 * float(np.median(np.abs(r[:rows]))), 1e-9)
+    scale = max(robust_sigma(r[:rows]), 1e-9)
     # The prior is known, the scale of the residuals is not.
     size = np.concatenate([np.full(rows, 1.0 / scale**2), np.ones(len(r) - rows)])
     H = (J * (w * size)[:, None]).T @ J
@@ -1370,7 +1370,7 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
     mid = np.linalg.pinv(V)[-1]
     guess = values[at][:, others] @ mid
     error = values - guess
-    scale = 1.4826 * float(np.median(np.abs(error)))
+    scale = robust_sigma(error)
     # A cubic misses a tenth of a fast swing's window.
     local = np.ptp(values[at][:, others], axis=1)
     far = np.abs(error) > np.maximum(np.maximum(_FAR * scale, 0.25 * local), 1e-12)
@@ -1467,7 +1467,7 @@ def decrement(t_s: FloatArray, phi_rad: FloatArray, noise_rad: float = 0.0) -> D
     log = np.log(height[:used])
     i, j = np.triu_indices(used, 1)
     slope = float(np.median((log[j] - log[i]) / (k[j] - k[i])))
-    scatter = 1.4826 * float(np.median(np.abs(log - slope * k - np.median(log - slope * k))))
+    scatter = robust_sigma(log - slope * k - np.median(log - slope * k))
     lever = k - k.mean()
     total = max(float(np.sum(lever**2)), 1e-12)
     # The scatter of few peaks may be small by chance; it cannot be less than what the noise makes.
@@ -1540,8 +1540,8 @@ def _one(eps: FloatArray, force: FloatArray, order: int) -> StiffnessFit:
         k / size,
         spread / size,
         inverse / np.outer(root, root),
-        float(np.sqrt(np.mean(residual**2))),
-        float(np.sqrt(np.mean(left**2))),
+        rms(residual),
+        rms(left),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, rms, robust_sigma
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged, section_json
@@ -527,7 +527,7 @@ def fit_pump(
         tuple(names[k] for k in free),
         {names[k]: float(s) for k, s in zip(free, sigma, strict=True)},
         covariance / np.outer(safe, safe),
-        float(np.sqrt(np.mean(residual**2))),
+        rms(residual),
         cost,
         problem.shape,
         fixed,
@@ -616,7 +616,7 @@ def rms_ahead(fit: PumpFit, record: PumpRecord) -> float:
             late = t[rows] >= begin + 0.9 * _AHEAD_S
             errors.append((told - part.value)[late])
         begin += 0.1 * _AHEAD_S
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))) if errors else math.nan
+    return rms(np.concatenate([np.zeros(0), *errors]))
 
 
 def cross_validate(fit: PumpFit, records: Sequence[PumpRecord]) -> list[Held]:
@@ -635,7 +635,7 @@ def held_by(fit: PumpFit, record: PumpRecord) -> Held:
     """Errors of a fit on a recording that it has not seen."""
     late, off = _near_full(record), record.value - fit.run(record)
     settles = float(np.mean(off[late])) if late is not None else math.nan
-    return Held(record.name, float(np.sqrt(np.mean(off**2))), rms_ahead(fit, record), settles)
+    return Held(record.name, rms(off), rms_ahead(fit, record), settles)
 
 
 def _near_full(record: PumpRecord) -> BoolArray | None:
@@ -654,7 +654,7 @@ def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
     ends = np.array([one.settles for one in held if math.isfinite(one.settles)])
     if len(ends) < 2 or "level" not in fit.sigma:
         return fit, math.nan
-    between = float(np.sqrt(np.mean(ends**2)))
+    between = rms(ends)
     sigma = {**fit.sigma, "level": math.hypot(fit.sigma["level"], between)}
     return replace(fit, sigma=sigma), between
 
@@ -829,7 +829,7 @@ def fit_static_map(name: str, pwm: FloatArray, value: FloatArray) -> StaticMap:
     assert best is not None
     end, dead, scale = (float(v) for v in best.x)
     error = residual(best.x)
-    scatter = max(1.4826 * float(np.median(np.abs(error))), 1e-6)
+    scatter = max(robust_sigma(error), 1e-6)
     far = np.abs(error) > _FAR * scatter
     J = np.asarray(best.jac)[~far]
     inside = [k for k in range(3) if low[k] * 1.001 < best.x[k] < high[k] * 0.999]
@@ -892,7 +892,7 @@ class PumpFound:
     def held_rms(self, model: str, names: Sequence[str] | None = None) -> float | None:
         """RMS over recordings that were not fitted, each counting alike; None without any."""
         some = [h.rms for h in self.held[model] if names is None or h.name in names]
-        return float(np.sqrt(np.mean(np.square(some)))) if some else None
+        return rms(np.array(some)) if some else None
 
     def settles(self, model: str) -> tuple[float, float, int, int] | None:
         """Level, half its 95 % interval for a further run, and how many of the held runs end inside that

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, rms
 from calib.core.plot import (
     SIGMA,
     Band,
@@ -203,8 +203,8 @@ def _runs(result: PumpFound) -> Figure:
         for model, fit in result.fits.items():
             simulated = fit.run(record)
             marks.append(Curve(t, simulated, model, "line", _MODELS[model], 1.1))
-            rms = float(np.sqrt(np.mean((simulated - record.value) ** 2)))
-            errors.append(f"{held[model].get(record.name, rms):.2f}")
+            off = held[model].get(record.name, rms(simulated - record.value))
+            errors.append(f"{off:.2f}")
         title = f"{short(record.name, 20)}: {' / '.join(errors)}"
         x, y = "time (s)" if i + 3 >= len(records) else "", "" if i % 3 else result.unit
         panels.append(Plot(x, y, marks, title, (0.0, longest)))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, robust_sigma
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import PoseOptions
@@ -407,7 +407,7 @@ def release_s(log: Log, t_s: FloatArray, phi: FloatArray, noise_rad: float) -> f
     gyro = log.signals("gz_radps")
     first = gyro.values[gyro.t_s <= gyro.t_s[0] + _HELD_S, 0]
     rate = gyro.values[:, 0] - np.median(first)
-    k = let_go(gyro.t_s, rate, 1.4826 * float(np.median(np.abs(first - np.median(first)))))
+    k = let_go(gyro.t_s, rate, robust_sigma(first - np.median(first)))
     if k is None:
         return None
     rise = (rate[k + 1] - rate[k]) / (gyro.t_s[k + 1] - gyro.t_s[k])

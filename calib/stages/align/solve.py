@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
-from calib.core.arrays import BoolArray, FloatArray, integral
+from calib.core.arrays import BoolArray, FloatArray, integral, rms, robust_sigma
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none
@@ -441,7 +441,7 @@ def _like_neighbours(phi: FloatArray) -> BoolArray:
     filled = np.where(np.isfinite(phi), phi, np.nanmedian(phi) if np.isfinite(phi).any() else 0.0)
     padded = np.concatenate([filled[2:0:-1], filled, filled[-2:-4:-1]])
     off = filled - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    limit = max(6.0 * 1.4826 * float(np.median(np.abs(off))), 0.04)
+    limit = max(6.0 * robust_sigma(off), 0.04)
     return np.asarray(np.isfinite(phi) & (np.abs(off) <= limit))
 
 
@@ -598,7 +598,7 @@ def _averaged(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _sample_noise(values: FloatArray) -> float:
     """Robust deviation of one sample from fourth differences, which slow motion does not reach."""
-    return 1.4826 * float(np.median(np.abs(np.diff(values, 4)))) / math.sqrt(70.0)
+    return robust_sigma(np.diff(values, 4)) / math.sqrt(70.0)
 
 
 def _at_rest(t: FloatArray, values: FloatArray, at: FloatArray, most: float) -> BoolArray:
@@ -638,7 +638,7 @@ def _loose(knots: Knots, piece: Piece) -> FloatArray:
     steps = np.maximum(np.diff(t), 1e-4)
     bend = np.diff(np.diff(piece.theta) / steps) / steps[1:]
     out = np.empty((len(at), 2))
-    out[:, 0] = _FREE[0] + _TIMES_FELT * float(np.sqrt(np.mean(bend**2)))
+    out[:, 0] = _FREE[0] + _TIMES_FELT * rms(bend)
     out[:, 1] = _UNFELT_MPS2
     if np.isfinite(ax).any():
         out[:, 1] = _FREE[1] + _TIMES_FELT * float(np.nanstd(ax))
@@ -1015,11 +1015,6 @@ def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
     return total
 
 
-def _rms(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
-
-
 def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
     return tuple(
         Trace(
@@ -1048,6 +1043,9 @@ def _check(
         value = float(np.median(values)) if values else math.nan
         return 1.0 / value if invert else value
 
+    def known_rms(values: FloatArray) -> float | None:
+        return finite_or_none(rms(values[np.isfinite(values)]))
+
     return LogCheck(
         name=log.source,
         pictures=len(good),
@@ -1062,9 +1060,9 @@ def _check(
         repeated_stamps=sum(piece.camera.repeated + piece.imu.repeated for piece in mine),
         missing=sum(piece.camera.missing + piece.imu.missing for piece in mine),
         turned_rad=float(np.std(np.concatenate(phi))) if phi else 0.0,
-        camera_rms_px=finite_or_none(_rms(np.concatenate(pictures))) if pictures else None,
-        gyro_rms_radps=finite_or_none(_rms(imu[:, 2])),
-        accel_rms_mps2=finite_or_none(_rms(imu[:, :2])),
+        camera_rms_px=known_rms(np.concatenate(pictures)) if pictures else None,
+        gyro_rms_radps=known_rms(imu[:, 2]),
+        accel_rms_mps2=known_rms(imu[:, :2]),
     )
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from calib.core.arrays import FloatArray, IntArray, blocks
+from calib.core.arrays import FloatArray, IntArray, blocks, rms
 from calib.stages.arm.model import (
     CHORD,
     DAILY,
@@ -254,16 +254,12 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
 _NONE = np.zeros(0)
 
 
-def _rms(error: FloatArray) -> float:
-    return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
-
-
 def errors_by(values: Mapping[str, float], trial: Trial) -> Errors:
     """Free-run errors on a trial, of parameters by name on its day."""
     off = by_command(trial, values)
     bent = by_pressure(trial, values).get("angle_rad", _NONE)
     names = ("angle_rad", "chord_m", "pressure_kpa")
-    return {name: _rms(off.get(name, _NONE)) for name in names} | {"angle_by_pressure_rad": _rms(bent)}
+    return {name: rms(off.get(name, _NONE)) for name in names} | {"angle_by_pressure_rad": rms(bent)}
 
 
 def errors_of(made: Fit, trial: Trial) -> Errors:
@@ -302,7 +298,7 @@ def _arx_error(order: int, train: Sequence[_Pair], test: _Pair) -> float:
     for k in range(order, len(y)):
         past = np.concatenate([out[k - order : k][::-1], u[k - order : k][::-1], [1.0]])
         out[k] = min(max(float(weights @ past), low), high)
-    return _rms(out - y)
+    return rms(out - y)
 
 
 def _lag_error(train: Sequence[_Pair], test: _Pair) -> float:
@@ -319,9 +315,9 @@ def _lag_error(train: Sequence[_Pair], test: _Pair) -> float:
         rows = np.concatenate([np.stack([lagged(u, lag_s), np.ones(len(u))], axis=1) for u, _ in train])
         y = np.concatenate([y for _, y in train])
         line = np.linalg.lstsq(rows, y, rcond=None)[0]
-        best = min(best, (_rms(rows @ line - y), lag_s, line), key=lambda one: one[0])
+        best = min(best, (rms(rows @ line - y), lag_s, line), key=lambda one: one[0])
     u, y = test
-    return _rms(np.stack([lagged(u, best[1]), np.ones(len(u))], axis=1) @ best[2] - y)
+    return rms(np.stack([lagged(u, best[1]), np.ones(len(u))], axis=1) @ best[2] - y)
 
 
 def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Errors:

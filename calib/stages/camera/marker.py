@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from calib.core.arrays import AnyArray, BoolArray, FloatArray
+from calib.core.arrays import AnyArray, BoolArray, FloatArray, rms, robust_sigma
 from calib.core.errors import UsageError
 from calib.core.writing import Kind, column_names
 
@@ -263,7 +263,7 @@ def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
         return None
     used, weight = there.copy(), np.ones(len(points))
     origin = points[there].mean(axis=0)
-    scale = float(np.sqrt(np.mean((points[there] - origin) ** 2)))
+    scale = rms(points[there] - origin)
     x, y = ((points - origin) / max(scale, 1e-9)).T
     terms = np.stack([x * x, x * y, y * y, x, y], axis=1)
     for _ in range(4):
@@ -271,7 +271,7 @@ def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
         slope = np.hypot(2 * A * x + B * y + D, B * x + 2 * C * y + E)
         weight = 1.0 / np.maximum(slope, 1e-9)
         left = (terms @ conic - 1.0) * weight * scale
-        spread = 1.4826 * float(np.median(np.abs(left[used])))
+        spread = robust_sigma(left[used])
         used = there & (np.abs(left) < max(_FAR * spread, _SURELY_PX))
         if used.sum() < 0.5 * _RAYS:
             return None
@@ -281,7 +281,7 @@ def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
         return None
     middle = -0.5 * np.linalg.solve(Q, np.array([D, E]))
     axes = scale * np.sqrt((1.0 + middle @ Q @ middle) / values)
-    scatter = float(np.sqrt(np.mean(left[used] ** 2)))
+    scatter = rms(left[used])
     # Neighbouring rays share pixels: about one independent edge for each pixel of the outline.
     outline = 2 * np.pi * float(np.sqrt(axes.prod()))
     independent = min(float(used.sum()), outline)

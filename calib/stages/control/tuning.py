@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, ComplexArray, FloatArray
+from calib.core.arrays import BoolArray, ComplexArray, FloatArray, rms
 from calib.core.errors import BadInputError
 from calib.stages.actuator.dynamics import linearised, mass_matrix
 from calib.stages.actuator.kinematics import angle, forward
@@ -572,12 +572,8 @@ def _first(tick_s: float, hit: BoolArray) -> float | None:
     return float(found[0]) * tick_s if len(found) else None
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def _pair(error: FloatArray) -> tuple[float, float]:
-    return _rms(error[:, 0]), _rms(error[:, 1])
+    return rms(error[:, 0]), rms(error[:, 1])
 
 
 def tracking(
@@ -613,8 +609,8 @@ def tracking(
             jump_settle = settling_s(h, then - end, _BAND * abs(end - wanted))
     return Tracking(
         nothing if free else _pair(error[judged]),
-        float("nan") if free else _rms(1e3 * np.linalg.norm(head[judged], axis=1)),
-        _rms(turned[judged]),
+        float("nan") if free else rms(1e3 * np.linalg.norm(head[judged], axis=1)),
+        rms(turned[judged]),
         float("nan") if free else float(np.abs(error[judged]).max()),
         float(np.abs(turned[judged]).max()),
         nothing if free else _pair(error),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, blocks
+from calib.core.arrays import BoolArray, FloatArray, blocks, robust_sigma
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Severity, Verdict
@@ -222,7 +222,7 @@ def _jumps(bins: FloatArray, around: int, least: float) -> Iterator[tuple[int, f
     before = total[around:-around] - total[: -2 * around]
     change = (total[2 * around :] - total[around:-around] - before) / around
     middle = float(np.median(change))
-    spread = 1.4826 * float(np.median(np.abs(change - middle)))
+    spread = robust_sigma(change - middle)
     change = change - middle
     while True:
         i = int(np.argmax(np.abs(change)))

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.special import ndtri, stdtrit
 
-from calib.core.arrays import FloatArray, IntArray, integral
+from calib.core.arrays import FloatArray, IntArray, integral, robust_sigma
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
@@ -935,10 +935,6 @@ def _level(t_s: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _robust_size(values: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(values)))
-
-
 def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> str:
     """How a rate contradicts a reference of its angle; empty where it does not or hardly anything turns."""
     known = np.isfinite(seen_rad)
@@ -951,9 +947,9 @@ def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> s
     scale = 1.0
     for _ in range(3):
         rest = b - scale * a
-        near = np.abs(rest) <= 4.0 * max(_robust_size(rest), 1e-6)
+        near = np.abs(rest) <= 4.0 * max(robust_sigma(rest), 1e-6)
         scale = float(a[near] @ b[near]) / max(float(a[near] @ a[near]), 1e-12)
-    left_rad = _robust_size(b - scale * a)
+    left_rad = robust_sigma(b - scale * a)
     most = max(float(a.std()), float(b[np.abs(b) <= 4.0 * b.std()].std()))
     if left_rad > max(_MOST_APART * most, _MOST_APART_RAD):
         return f"the rate leaves {math.degrees(left_rad):.2g} of {math.degrees(most):.2g} deg unexplained"
@@ -1001,9 +997,9 @@ def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> f
         left = felt - _level(t_s, np.interp(t_s - late, t_s, theta))
         lever = _level(t_s, np.interp(t_s - late, t_s, turning))
         fit = float(left[known] @ lever[known]) / max(float(lever[known] @ lever[known]), 1e-12)
-        rests.append(_robust_size((left - fit * lever)[known]))
+        rests.append(robust_sigma((left - fit * lever)[known]))
     k, zero = int(np.argmin(rests)), len(rests) // 2
-    clear = rests[k] < min(_LEFT_OF_FELT * _robust_size(felt[known]), _LEFT_OF_REST * rests[zero])
+    clear = rests[k] < min(_LEFT_OF_FELT * robust_sigma(felt[known]), _LEFT_OF_REST * rests[zero])
     return float(_LATE_S[k]) if clear and k not in (0, len(rests) - 1) else 0.0
 
 
@@ -1029,7 +1025,7 @@ def _later(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> 
     for _ in range(3):
         fit = np.asarray(np.linalg.lstsq(X[kept], apart[kept], rcond=None)[0], dtype=np.float64)
         left = apart - X @ fit
-        kept = np.abs(left) <= 4.0 * max(_robust_size(left), 1e-6)
+        kept = np.abs(left) <= 4.0 * max(robust_sigma(left), 1e-6)
     size = float(X[kept, 0] @ X[kept, 0])
     together = np.bincount(of, np.where(kept, X[:, 0] * left, 0.0))
     sigma = math.sqrt(float(together @ together)) / max(size, 1e-300)
