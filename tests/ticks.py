@@ -15,8 +15,9 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.stages.actuator.kinematics import chord_ratio_w
 from calib.stages.camera.model import FISHEYE, Camera, undistort
-from calib.stages.estimator.constant_gain import ALONE, BOOST, BOOST_TICKS, MOVING_TICKS, PATIENCE, Gains
+from calib.stages.estimator.constant_gain import ALONE, BOOST, BOOST_TICKS, MOVING_TICKS, PATIENCE
 from calib.stages.estimator.kinematic import Rows, Setup
+from calib.stages.estimator.section import EstimatorGain
 from calib.stages.estimator.sensors import GRAVITY_MPS2
 
 GAINED = ("phi_rad", "length_m", "bias_rad", "rate_m")
@@ -96,7 +97,7 @@ def _means(
     return out
 
 
-def run_gains(gains: Gains, setup: Setup, ticks: Ticks, mean_rate: bool = False) -> FloatArray:
+def run_gains(gains: EstimatorGain, setup: Setup, ticks: Ticks, mean_rate: bool = False) -> FloatArray:
     """Estimates (n, len(GAINED)) after each tick.
 
     Parameters

@@ -65,16 +65,16 @@ def check_readable(path: Path) -> int:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Raise `BadInputError` for what the system says against reading a file."""
+def to_be(done: str, path: Path) -> Iterator[None]:
+    """Raise `BadInputError` for what the system says against a path that is to be "read" or "written"."""
     try:
         yield
     except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+        raise BadInputError(f"{shown(path)}: cannot be {done}: {error.strerror or error}") from error
 
 
 def _size(path: Path) -> int:
-    with reading(path):
+    with to_be("read", path):
         status = path.stat()
     if stat.S_ISDIR(status.st_mode):
         raise BadInputError(f"{shown(path)}: is a folder, expected a file")
@@ -88,7 +88,7 @@ def read_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
     size = check_readable(path)
     data = b""
     if size <= most:
-        with reading(path), path.open("rb") as stream:
+        with to_be("read", path), path.open("rb") as stream:
             data = stream.read(most + 1)
     if max(size, len(data)) > most:
         raise BadInputError(f"{shown(path)}: is larger than {most / 1e6:g} MB")
@@ -116,7 +116,7 @@ def sha256(data: bytes) -> str:
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file of any size in hexadecimal, or a `BadInputError` that says why not."""
     _size(path)
-    with reading(path), path.open("rb") as stream:
+    with to_be("read", path), path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 

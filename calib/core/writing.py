@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 from calib.core.command import current, number_of
 from calib.core.errors import BadInputError, ReaderGoneError
-from calib.core.files import PICTURES, shown
+from calib.core.files import PICTURES, shown, to_be
 
 _TEMPORARY = ".calib.tmp"
 """End of the names of temporary files."""
@@ -186,10 +186,8 @@ def check_figures(folder: Path) -> None:
 
 def make_folder(path: Path) -> None:
     """Create a folder to write into, or a `BadInputError` that says why not."""
-    try:
+    with to_be("made a folder", path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be made a folder: {error.strerror or error}") from error
 
 
 def _target(path: Path) -> Path:
@@ -282,10 +280,8 @@ def appending(path: Path, kind: Kind | None = None) -> BinaryIO:
     """
     check_writable(path, kind)
     descriptor = _through(path)
-    try:
+    with to_be("written", path):
         return _duplicate(descriptor) if descriptor is not None else _target(path).open("ab")
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
 
 
 def write_atomically(path: Path, data: bytes | str, kind: Kind | None = None, durable: bool = True) -> None:
@@ -299,10 +295,8 @@ def move(path: Path, target: Path) -> None:
     """Give a file another name on the same disk. Raises `BadInputError`, as where that name is taken."""
     if target.exists():
         raise BadInputError(f"{shown(target)}: is there already; {shown(path)} stays where it is")
-    try:
+    with to_be("moved", path):
         path.rename(target)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be moved: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager

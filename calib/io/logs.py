@@ -30,7 +30,7 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
-from calib.core.files import check_readable, is_bag, reading, shown
+from calib.core.files import check_readable, is_bag, shown, to_be
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
@@ -296,7 +296,7 @@ def iter_rows(
 
 
 def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
-    with reading(path), open_text(path) as stream:
+    with to_be("read", path), open_text(path) as stream:
         yield from iter_rows(stream, shown(path), path, options)
 
 

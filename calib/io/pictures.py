@@ -21,7 +21,7 @@ import numpy as np
 
 from calib.core.arrays import AnyArray, GrayImage
 from calib.core.errors import BadInputError, pip_install
-from calib.core.files import PICTURES, read_bytes, sha256, shown
+from calib.core.files import PICTURES, read_bytes, sha256, shown, to_be
 
 # ----------------------------------------------------------------------
 # How many pixels the header of a picture declares: known before anything is decoded or allocated.
@@ -146,10 +146,8 @@ def list_pictures(sources: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for source in sources:
         if source.is_dir():
-            try:
+            with to_be("listed", source):
                 inside = [p for p in source.iterdir() if _is_picture_file(p)]
-            except OSError as error:
-                raise BadInputError(f"{shown(source)}: cannot be listed: {error.strerror}") from error
             if not inside:
                 kinds = ", ".join(suffix[1:] for suffix in PICTURES)
                 raise BadInputError(f"{shown(source)}: holds no pictures, expected files of {kinds}")

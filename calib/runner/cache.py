@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from calib.core import __version__
 from calib.core.errors import BadInputError
-from calib.core.files import file_sha256, sha256, shown
+from calib.core.files import file_sha256, sha256, shown, to_be
 from calib.core.words import Block
 from calib.core.writing import check_folder, make_folder, settle, sweep, try_lock, write_atomically
 
@@ -77,10 +77,8 @@ def held(path: Path, folder: Path, verb: str) -> Iterator[int | None]:
 
     Raises `BadInputError` while another process holds it, and where the file cannot be made.
     """
-    try:
+    with to_be("written", path):
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
     try:
         if not try_lock(descriptor):
             raise BadInputError(
@@ -241,13 +239,11 @@ def store(work: Path, folder: Path, key: str, code: int, trash: Path) -> Result:
     told: dict[str, Any] = {"schema": 1, "key": key, "code": code, "files": files}
     told["sha256"] = _digest(told)
     write_atomically(work / _RESULT, json.dumps(told, indent=1, sort_keys=True) + "\n")
-    try:
+    with to_be("written", folder):
         if folder.exists():
             folder.rename(trash)
         work.rename(folder)
         settle(folder.parent)
-    except OSError as error:
-        raise BadInputError(f"{shown(folder)}: cannot be written: {error.strerror or error}") from error
     remove(trash)
     return Result(folder, key, code, files)
 

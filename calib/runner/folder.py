@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib.core.errors import BadInputError
-from calib.core.files import PICTURES, file_sha256, inside, one_line, shown, slug
+from calib.core.files import PICTURES, file_sha256, inside, one_line, shown, slug, to_be
 from calib.core.options import NOTHING_STATED, LogOptions
 
 _LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
@@ -134,10 +134,8 @@ def _pictures(folder: Path, taken: Callable[[Path], bool]) -> tuple[tuple[Path, 
 def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     if not folder.is_dir():
         return []
-    try:
+    with to_be("listed", folder):
         found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
-    except OSError as error:
-        raise BadInputError(f"{shown(folder)}: cannot be listed: {error.strerror or error}") from error
     return sorted(found, key=lambda path: path.name)
 
 

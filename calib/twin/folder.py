@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from calib.core.errors import BadInputError
-from calib.core.files import shown
+from calib.core.files import shown, to_be
 from calib.core.writing import write_atomically
 from calib.io.logs import log_text
 from calib.twin.pictures import BOARD, PLANE, Plane, Shot, plane_shot, shots, write_pictures
@@ -87,14 +87,12 @@ def write_rig_folder(
     Raises `BadInputError` for a folder that is not empty or cannot be written, and for a camera that
     does not see the actuator.
     """
-    try:
+    with to_be("written", folder):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise BadInputError(f"{shown(folder)}: is there already, expected a new or an empty folder")
         (folder / "logs").mkdir(parents=True, exist_ok=True)
         taken = [replace(shot, seed=shot.seed + _PICTURES_SEEDS * seed) for shot in _views(rig.view)]
         write_pictures(folder / "images", rig.view.camera, taken)
-    except OSError as error:
-        raise BadInputError(f"{shown(folder)}: cannot be written: {error.strerror or error}") from error
     written = []
     for index, (name, (scenario, options)) in enumerate(LOGS.items()):
         run = run_scenario(make_scenario(scenario, options), rig, len(LOGS) * seed + index, feedback)

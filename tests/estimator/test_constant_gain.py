@@ -8,12 +8,12 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from estimatorlogs import rows_from, setup_for, simulated, truth
+from pydantic import TypeAdapter
 from ticks import Ticks, run_gains, ticks_of
 
 from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
 from calib.stages.estimator.constant_gain import (
     MOST_DELAY_TICKS,
-    Gains,
     TickNoise,
     design,
     tick_noise,
@@ -30,7 +30,7 @@ def _setup() -> Setup:
     return setup_for(simulated("static", 0)[0], 0)
 
 
-def _gains(setup: Setup, delay_ticks: float = 1.5) -> Gains:
+def _gains(setup: Setup, delay_ticks: float = 1.5) -> EstimatorGain:
     return design(NOISE, 60.0, delay_ticks * T, 0.0325 + float(setup.start.sensor[6]))
 
 
@@ -136,7 +136,7 @@ def test_gains_of_a_precise_and_late_camera_stand_in_the_file() -> None:
     """A length is then corrected by more than its residual."""
     gains = design(TickNoise(3e-5 / 0.0475, 3e-5, NOISE.gyro_radps, NOISE.accel_rad), 60.0, 7.9 * T, 0.0475)
     assert gains.moving_length > 1.0
-    assert EstimatorGain(**asdict(gains)).moving_length == gains.moving_length
+    assert TypeAdapter(EstimatorGain).validate_python(asdict(gains)).moving_length == gains.moving_length
 
 
 @pytest.mark.parametrize("ticks", [0.0, 0.4, 1.5, 3.0, float(MOST_DELAY_TICKS)])

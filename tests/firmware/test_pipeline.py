@@ -25,7 +25,6 @@ from calib.stages.control.laws import (
     Pid,
     feed_forward,
 )
-from calib.stages.estimator.constant_gain import Gains
 from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.firmware.conformance import (
     ACCEL_WEAK,
@@ -366,7 +365,7 @@ def test_the_reference_is_the_projects_estimator(mean_rate: bool) -> None:
     constants = made.values
     section = whole.estimator
     assert section is not None and section.constant_gain is not None and whole.align is not None
-    gains = Gains(**section.constant_gain.model_dump())
+    gains = section.constant_gain
     ticks = list(coherent(constants, 700))
     for k in (90, 91, 300, 420):
         ticks[k] = replace(ticks[k], marker_seen=False)

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import BadInputError, CalibError, UsageError
-from calib.core.files import PICTURES, check_readable, hash_of, one_line, read_yaml_mapping, shown
+from calib.core.files import PICTURES, check_readable, hash_of, one_line, read_yaml_mapping, shown, to_be
 from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.workers import Workers
@@ -505,28 +505,23 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     BadInputError
         For files that cannot be opened, are not UTF-8 text, or have lines of absurd length.
     """
-    try:
-        with path.open("rb") as file:
-            number = 0
-            while raw := file.readline(_LONGEST_LINE):
-                number += 1
-                if b"\0" in raw:
-                    raise BadInputError(
-                        f"{shown(path)}: line {number} has a zero byte; expected a text file, not binary data"
-                    )
-                if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
-                    raise BadInputError(
-                        f"{shown(path)}: line {number} has more than {_LONGEST_LINE} characters"
-                    )
-                try:
-                    text = raw.decode("utf-8-sig" if number == 1 else "utf-8")
-                except UnicodeDecodeError as error:
-                    raise BadInputError(
-                        f"{shown(path)}: line {number} is not UTF-8 text (byte 0x{raw[error.start]:02x})"
-                    ) from error
-                yield number, text.rstrip("\r\n")
-    except OSError as error:
-        raise BadInputError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    with to_be("read", path), path.open("rb") as file:
+        number = 0
+        while raw := file.readline(_LONGEST_LINE):
+            number += 1
+            if b"\0" in raw:
+                raise BadInputError(
+                    f"{shown(path)}: line {number} has a zero byte; expected a text file, not binary data"
+                )
+            if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
+                raise BadInputError(f"{shown(path)}: line {number} has more than {_LONGEST_LINE} characters")
+            try:
+                text = raw.decode("utf-8-sig" if number == 1 else "utf-8")
+            except UnicodeDecodeError as error:
+                raise BadInputError(
+                    f"{shown(path)}: line {number} is not UTF-8 text (byte 0x{raw[error.start]:02x})"
+                ) from error
+            yield number, text.rstrip("\r\n")
 
 
 def _number(text: str, path: Path, line: int, column: str) -> float:

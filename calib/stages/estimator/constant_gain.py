@@ -10,6 +10,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.estimator.kinematic import Setup
+from calib.stages.estimator.section import EstimatorGain
 from calib.stages.estimator.sensors import GRAVITY_MPS2, SIZE, marker
 
 # ----------------------------------------------------------------------
@@ -51,34 +52,6 @@ class TickNoise:
     accel_rad: float
 
 
-@dataclass(frozen=True)
-class Gains:
-    """What the estimator runs with; lengths are in metres, rates per tick.
-
-    Attributes
-    ----------
-    rate_hz, delay_ticks : T = 1 / rate_hz, D. lever_m : l0 / 2 + d.
-    camera_phi, accel_phi, bias : K_c, K_a, K_b.
-    moving_length, moving_rate, rest_length, rate_decay : K_m, K_v, K_r, K_d.
-    slow : K_s. moving_m, still_m : s_0, v_0. gate_m : of the residuals of a picture.
-    """
-
-    rate_hz: float
-    delay_ticks: float
-    lever_m: float
-    camera_phi: float
-    accel_phi: float
-    bias: float
-    moving_length: float
-    moving_rate: float
-    rest_length: float
-    rate_decay: float
-    slow: float
-    moving_m: float
-    still_m: float
-    gate_m: float
-
-
 def _stationary(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> FloatArray:
     """K (n, m) of the stationary filter."""
     from scipy.linalg import solve_discrete_are
@@ -92,7 +65,7 @@ def _stationary(F: FloatArray, Q: FloatArray, H: FloatArray, R: FloatArray) -> F
     return np.asarray(K * scale[:, None] / unit, dtype=np.float64)
 
 
-def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> Gains:
+def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> EstimatorGain:
     """Gains for ticks of a rate and pictures that are late.
 
     Raises `BadInputError` for a rate that is not positive, and pictures more than `MOST_DELAY_TICKS` late or
@@ -123,7 +96,7 @@ def design(noise: TickNoise, rate_hz: float, delay_s: float, lever_m: float) -> 
     )
     rest = _stationary(np.eye(1), np.array([[_REST_WALK_M**2 * T]]), np.eye(1), camera)
     slow = 1.0 - math.exp(-T / _SLOW_S)
-    return Gains(
+    return EstimatorGain(
         rate_hz=rate_hz,
         delay_ticks=delay,
         lever_m=lever_m,

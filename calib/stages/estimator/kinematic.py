@@ -24,6 +24,7 @@ from calib.stages.estimator.event import (
     tell,
     update,
 )
+from calib.stages.estimator.section import EstimatorLevel
 from calib.stages.estimator.sensors import QUANTITIES, SIZE, head_position, invert_marker
 
 # ----------------------------------------------------------------------
@@ -45,40 +46,11 @@ from calib.stages.estimator.sensors import QUANTITIES, SIZE, head_position, inve
 LARGEST_STEP_S = 0.02
 
 
-@dataclass(frozen=True)
-class Level:
-    """Process noise of one level, for phi [rad] and for the length [m].
-
-    Attributes
-    ----------
-    name : for what it is made.
-    accel_phi_radps2, accel_length_mps2 : standard deviation of the acceleration.
-    memory_s : T_a of both. friction_s : T_v of the length; that of phi is infinite.
-    walk_phi_rad_per_sqrt_s, walk_length_m_per_sqrt_s : density of w_p.
-    """
-
-    name: str
-    accel_phi_radps2: float
-    accel_length_mps2: float
-    memory_s: float
-    friction_s: float
-    walk_phi_rad_per_sqrt_s: float
-    walk_length_m_per_sqrt_s: float
-
-    def numbers(self) -> list[float]:
-        """(1/T_a, 1/T_v, density of w_a, of w_p) of phi and then of the length."""
-        b, c = 1.0 / self.friction_s, 1.0 / self.memory_s
-        return [
-            c, 0.0, 2.0 * self.accel_phi_radps2**2 * c, self.walk_phi_rad_per_sqrt_s**2,
-            c, b, 2.0 * self.accel_length_mps2**2 * c, self.walk_length_m_per_sqrt_s**2,
-        ]  # fmt: skip
-
-
 LEVELS = (
-    Level("rest", 1.0, 3e-4, 0.04, 0.08, 5e-6, 1.5e-5),
-    Level("drift", 1.0, 8e-3, 0.04, 7.5, 5e-6, 3e-6),
-    Level("move", 20.0, 0.05, 0.02, 1.0, 1.3e-4, 2.6e-5),
-    Level("swing", 120.0, 0.8, 0.05, 50.0, 7e-4, 6e-5),
+    EstimatorLevel("rest", 1.0, 3e-4, 0.04, 0.08, 5e-6, 1.5e-5),
+    EstimatorLevel("drift", 1.0, 8e-3, 0.04, 7.5, 5e-6, 3e-6),
+    EstimatorLevel("move", 20.0, 0.05, 0.02, 1.0, 1.3e-4, 2.6e-5),
+    EstimatorLevel("swing", 120.0, 0.8, 0.05, 50.0, 7e-4, 6e-5),
 )
 """From rest over the slow and quick motion of the pumps to a free swing.
 
@@ -99,7 +71,7 @@ class Kinematic:
     sensor_walk : (14,) densities of the walk of `sensors.SENSOR`, unit per sqrt(s).
     """
 
-    levels: tuple[Level, ...] = LEVELS
+    levels: tuple[EstimatorLevel, ...] = LEVELS
     switch_hz: float = 0.1
     sensor_walk: tuple[float, ...] = tuple(one.walk for one in QUANTITIES.values())
 

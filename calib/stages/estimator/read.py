@@ -23,7 +23,7 @@ from calib.stages.align.section import SENSORS_OF
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
 from calib.stages.estimator.driven import PARAMETER, Drive
 from calib.stages.estimator.event import NOISE
-from calib.stages.estimator.kinematic import LEVELS, Kinematic, Level, Rows, Setup, Start
+from calib.stages.estimator.kinematic import LEVELS, Kinematic, Rows, Setup, Start
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import QUANTITIES, SENSOR, sensor_values, view_coefficients
 
@@ -251,9 +251,7 @@ def _process(rig: Rig) -> Kinematic:
             walks[at] = math.hypot(K, slow)
         elif most is not None:
             walks[at] = min(walks[at], math.hypot(most, slow))
-    levels: tuple[Level, ...] = LEVELS
-    if tuned is not None and tuned.levels:
-        levels = tuple(Level(**level.model_dump()) for level in tuned.levels)
+    levels = tuple(tuned.levels) if tuned is not None and tuned.levels else LEVELS
     return Kinematic(levels, sensor_walk=tuple(walks))
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import ConfigDict, Field, PrivateAttr
 
 from calib.core.errors import BadInputError
 from calib.core.result import Count, Number, Result, Section, Sigma, quantity
@@ -23,8 +23,19 @@ Gain = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)]
 LateGain = Annotated[float, Field(gt=0, lt=2, allow_inf_nan=False, strict=True)]
 
 
-class EstimatorLevel(Section):
-    """One level of process noise, see `calib.stages.estimator.kinematic.Level`."""
+@dataclass(frozen=True)
+class EstimatorLevel:
+    """Process noise of one level, for phi [rad] and for the length [m].
+
+    Attributes
+    ----------
+    name : for what it is made.
+    accel_phi_radps2, accel_length_mps2 : standard deviation of the acceleration.
+    memory_s : T_a of both. friction_s : T_v of the length; that of phi is infinite.
+    walk_phi_rad_per_sqrt_s, walk_length_m_per_sqrt_s : density of w_p.
+    """
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
 
     name: str
     accel_phi_radps2: Positive
@@ -34,10 +45,30 @@ class EstimatorLevel(Section):
     walk_phi_rad_per_sqrt_s: NotNegative
     walk_length_m_per_sqrt_s: NotNegative
 
+    def numbers(self) -> list[float]:
+        """(1/T_a, 1/T_v, density of w_a, of w_p) of phi and then of the length."""
+        b, c = 1.0 / self.friction_s, 1.0 / self.memory_s
+        return [
+            c, 0.0, 2.0 * self.accel_phi_radps2**2 * c, self.walk_phi_rad_per_sqrt_s**2,
+            c, b, 2.0 * self.accel_length_mps2**2 * c, self.walk_length_m_per_sqrt_s**2,
+        ]  # fmt: skip
 
-class EstimatorGain(Section):
-    """The fused estimator with constant gains, for a controller; see
-    `calib.stages.estimator.constant_gain.Gains`."""
+
+@dataclass(frozen=True)
+class EstimatorGain:
+    """What the fused estimator of `calib.stages.estimator.constant_gain` runs with on a controller.
+
+    Lengths are in metres, rates per tick.
+
+    Attributes
+    ----------
+    rate_hz : of the ticks, 1 / T. delay_ticks : D, age of a picture. lever_m : l0 / 2 + d.
+    camera_phi : K_c. accel_phi : K_a. bias : K_b.
+    moving_length : K_m. moving_rate : K_v. rest_length : K_r. rate_decay : K_d.
+    slow : K_s. moving_m : s_0. still_m : v_0. gate_m : of the residuals of a picture.
+    """
+
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
 
     rate_hz: Positive
     delay_ticks: Annotated[float, Field(ge=0, le=8, allow_inf_nan=False, strict=True)]

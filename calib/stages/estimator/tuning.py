@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from calib.stages.estimator.kinematic import Rows, Setup
 from calib.stages.estimator.noise import tune
 from calib.stages.estimator.read import drive_from_rig, noise_at_rest, pwm_of, rows_of
 from calib.stages.estimator.replay import joined, opened
-from calib.stages.estimator.section import Estimator, EstimatorDriven, EstimatorGain, EstimatorLevel
+from calib.stages.estimator.section import Estimator, EstimatorDriven, EstimatorGain
 
 _MOST_ROWS = 20_000
 _MOST_DRIVEN_ROWS = 6_000
@@ -33,7 +33,7 @@ def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
     if setup.delay_s * rate_hz > MOST_DELAY_TICKS or not setup.view.any():
         return None
     lever_m = 0.5 * float(setup.start.head[1]) + float(setup.start.sensor[6])
-    return EstimatorGain(**asdict(design(tick_noise(setup), rate_hz, setup.delay_s, lever_m)))
+    return design(tick_noise(setup), rate_hz, setup.delay_s, lever_m)
 
 
 def _driven_section(
@@ -101,7 +101,7 @@ def tuned_section(
     return Estimator(
         jitter_px=found_noise.jitter_px.value,
         sigma=sigma,
-        levels=[EstimatorLevel(**asdict(level)) for level in found_noise.setup.process.levels],
+        levels=list(found_noise.setup.process.levels),
         driven=driven,
         constant_gain=gain_section(found_noise.setup, rig.tick_hz),
         gain_per_row=(found_noise.after - found_noise.before) / max(found_noise.rows, 1),

@@ -22,7 +22,7 @@ from calib.stages.camera.model import project
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
 from calib.stages.estimator import constant_gain
-from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, SHAKING_RADPS2, Gains, TickNoise
+from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, SHAKING_RADPS2, TickNoise
 from calib.stages.estimator.section import EstimatorGain
 from calib.stages.estimator.sensors import GRAVITY_MPS2
 from calib.stages.firmware.section import Envelope
@@ -393,7 +393,9 @@ def _envelope(
 _WEAK_MPS2 = 1.0
 
 
-def _designed(lookup: Lookup, rate_hz: float, delay: float, plane: PlaneConstants, rest: float) -> Gains:
+def _designed(
+    lookup: Lookup, rate_hz: float, delay: float, plane: PlaneConstants, rest: float
+) -> EstimatorGain:
     """Gains for the noise that the alignment has found, at the head's rest; a tracker of whole pixels."""
     d = lookup.number("align.marker_offset_m", 0.0)
     # How places of the marker change with a pixel there, by the undistorted plane.
@@ -429,7 +431,7 @@ def _fused(
         }
     tuned = lookup.find("estimator.constant_gain")
     if isinstance(tuned, EstimatorGain) and abs(tuned.rate_hz / rate_hz - 1.0) <= 1e-6:
-        gain, source = Gains(**tuned.model_dump()), "Gains of estimator.constant_gain."
+        gain, source = tuned, "Gains of estimator.constant_gain."
     else:
         gain, source = _designed(lookup, rate_hz, delay, plane, rest), "Gains for the noise in align."
         if tuned is not None:
