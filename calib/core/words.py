@@ -287,6 +287,11 @@ def several(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + more
 
 
+def all_of(names: Sequence[str]) -> str:
+    """Names for a sentence, as a, b and c."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
 def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
     """Parts of one kind as a table, a row for each, with their names in front where they have some."""
     named = parts if isinstance(parts, Mapping) else {str(i): one for i, one in enumerate(parts)}

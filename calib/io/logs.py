@@ -34,6 +34,7 @@ from calib.core.files import check_readable, is_bag, shown, to_be
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
+from calib.core.words import all_of
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
     ACCEL,
@@ -125,15 +126,15 @@ class Log:
         """
         lacking = [name for name in names if name not in self.columns]
         if lacking:
-            has = f"has no {_listed(lacking)}, expected {_listed(names)} beside t_s"
+            has = f"has no {all_of(lacking)}, expected {all_of(names)} beside t_s"
             raise BadInputError(f"{self.source}: {has}")
         blank = [name for name in names if np.isnan(self.columns[name]).all()]
         if blank:
-            raise BadInputError(f"{self.source}: {_listed(blank)} hold{'s' * (len(blank) == 1)} no number")
+            raise BadInputError(f"{self.source}: {all_of(blank)} hold{'s' * (len(blank) == 1)} no number")
         others = [name for name in optional if name in self.columns and name not in names]
         wanted = (*names, *(name for name in others if np.isfinite(self.columns[name]).any()))
         if not wanted:
-            raise BadInputError(f"{self.source}: has no reading of {_listed(optional)}")
+            raise BadInputError(f"{self.source}: has no reading of {all_of(optional)}")
         if not counts:
             refuse_counts(self, wanted)
         check_time(self)
@@ -618,10 +619,6 @@ def _apart(log: Log, names: Sequence[str]) -> Log | None:
 
 def _any(log: Log, names: Sequence[str]) -> IntArray:
     return np.nonzero(np.logical_or.reduce([np.isfinite(log.columns[name]) for name in names]))[0]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 @dataclass

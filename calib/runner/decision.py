@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from calib.core.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_POOR, BadInputError
 from calib.core.files import read_text
 from calib.core.verdict import POOR, Word
-from calib.core.words import several
+from calib.core.words import all_of, several
 
 # ----------------------------------------------------------------------
 # run.json: what a run tells the page, read from a folder that may come from anywhere.
@@ -174,8 +174,7 @@ def _answer(
 def _titles(jobs: Sequence[Mapping[str, Any]], what: str = "") -> str:
     """Headings of the jobs, as a sentence where it is said what they are."""
     names = list(dict.fromkeys(f"“{job['title']}”" for job in jobs))
-    text = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"{text} {'is' if len(names) == 1 else 'are'} {what}" if what else text
+    return f"{all_of(names)} {'is' if len(names) == 1 else 'are'} {what}" if what else all_of(names)
 
 
 def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:

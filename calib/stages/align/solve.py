@@ -16,6 +16,7 @@ from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none
 from calib.core.rig import Geometry
 from calib.core.verdict import Finding, Verdict
+from calib.core.words import all_of
 from calib.solve.clock import TimeAxis, time_axis
 from calib.solve.delay import moments, shares, vertex
 from calib.solve.groups import tied_groups
@@ -1246,8 +1247,8 @@ def _separable(found: Alignment) -> Iterator[Finding]:
             words = [QUANTITIES[SENSOR[k]].words for k in group]
             yield Finding(
                 "remark",
-                f"hardly told apart from each other: {', '.join(words[:-1])} and {words[-1]}; what they do "
-                "together is known much better than each, see the covariance",
+                f"hardly told apart from each other: {all_of(words)}; what they do together is known much "
+                "better than each, see the covariance",
             )
     if unlearnt:
         names = ", ".join(QUANTITIES[SENSOR[k]].words for k in unlearnt)

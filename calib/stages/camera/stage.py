@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
 from calib.core.options import NoOptions, option
-from calib.core.stage import Files, Stage
+from calib.core.stage import Files, Stage, later
 from calib.core.units import parse_region_px
 from calib.stages.camera.options import IntrinsicsOptions
 
@@ -346,10 +346,6 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
     ).with_evidence(PlaneEvidence(optics, fit, inputs.left_out))
 
 
-def _plane_document(result: Plane) -> dict[str, Any]:
-    return {"not_used": _not_used(result.evidence.left_out)}
-
-
 def _plane_words(result: Plane) -> list[Block]:
     from calib.core.words import Line, Table
 
@@ -382,7 +378,7 @@ extrinsics = Stage(
     optional=True,
     writes=("plane",),
     needs=("camera",),
-    document=_plane_document,
+    document=lambda plane: {"not_used": _not_used(plane.evidence.left_out)},
     words=_plane_words,
     plots=_plane_plots,
     remarks=lambda rig: rig.outdated(),
@@ -452,12 +448,6 @@ def _lens_words(result: Lens) -> list[Block]:
     ]
 
 
-def _lens_plots(result: Lens) -> dict[str, Figure]:
-    from calib.stages.camera.plots import lens_plots
-
-    return lens_plots(result)
-
-
 distortion = Stage(
     "distortion",
     "Lens",
@@ -472,5 +462,5 @@ distortion = Stage(
     needs=("camera",),
     uses=("plane",),
     words=_lens_words,
-    plots=_lens_plots,
+    plots=later("calib.stages.camera.plots", "lens_plots"),
 )

@@ -44,9 +44,9 @@ _TWO = ("blue", "grey")
 _INNOVATIONS = [OUT.index(name) for _, names, _ in _SENSORS for name in names]
 
 
-def plots(results: Sequence[Replayed]) -> dict[str, Figure]:
+def plots(outcome: list[Replayed] | Replayed) -> dict[str, Figure]:
     """`replay_<log>_states`, `_innovations` and, with a truth, `_errors` of each log."""
-    figures = {}
+    results, figures = outcome if isinstance(outcome, list) else [outcome], {}
     stems = [Path(one.source).stem for one in results]
     for k, (result, stem) in enumerate(zip(results, stems, strict=True)):
         name = f"replay_{stem}_{k + 1}" if stems.count(stem) > 1 else f"replay_{stem}"

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from calib.core.errors import BadInputError, UsageError
 from calib.core.options import LogOptions, option
-from calib.core.stage import Files, Output, Stage
+from calib.core.stage import Files, Output, Stage, later
 
 if TYPE_CHECKING:
-    from calib.core.plot import Figure
     from calib.core.rig import Rig
-    from calib.stages.estimator.section import Estimator, Replayed
+    from calib.stages.estimator.section import Replayed
 
 
 @dataclass(frozen=True)
@@ -129,20 +128,10 @@ def _solve(inputs: ReplayInputs) -> list[Replayed]:
     return results
 
 
-def _tuned(results: list[Replayed]) -> tuple[Estimator | None]:
-    return (results[0].tuned,)
-
-
 def _document(results: list[Replayed]) -> dict[str, Any]:
     from calib.core.result import section_json
 
     return {"replay": {"logs": [section_json(one, whole=True) for one in results]}}
-
-
-def _plots(outcome: list[Replayed] | Replayed) -> dict[str, Figure]:
-    from calib.stages.estimator.plots import plots
-
-    return plots(outcome if isinstance(outcome, list) else [outcome])
 
 
 replay = Stage(
@@ -161,9 +150,9 @@ replay = Stage(
         "States to write, .csv, .parquet or .mcap; with several logs a folder, made if needed.", None
     ),
     writes=("estimator",),
-    parts=_tuned,
+    parts=lambda results: (results[0].tuned,),
     on_request="tune",
     uses=("camera", "plane", "geometry", "imu", "align", "actuator", "pump", "estimator"),
     document=_document,
-    plots=_plots,
+    plots=later("calib.stages.estimator.plots", "plots"),
 )
