@@ -10,6 +10,7 @@ import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
 from outside import outside
 
+from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.actuator.identify_pump import (
     LAG,
@@ -261,6 +262,12 @@ def test_columns_are_recognised(tmp_path: Path, head: str, unit: str) -> None:
     assert table.unit == unit
     assert table.record is not None
     assert np.allclose(table.record.value, _rows()[:, 2], atol=1e-4)
+
+
+def test_shares_of_the_full_duty_are_refused(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", _rows() / [1.0, 255.0, 1.0])
+    with pytest.raises(BadInputError, match=r"a\.csv: PWM is 1 at most, expected 0 to 255; .*by 255"):
+        read_pump_table(path)
 
 
 def test_real_tables(shared_data: Path) -> None:

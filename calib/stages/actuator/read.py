@@ -66,8 +66,8 @@ def read_pump_table(
 
     Raises
     ------
-    BadInputError for missing columns, text for a number, PWM outside 0 .. 255, time that runs back or
-    jumps, and tables that are too short.
+    BadInputError for missing columns, text for a number, PWM outside 0 .. 255 or as a share of the full duty,
+    time that runs back or jumps, and tables that are too short.
     """
     cells, what = read_cells(path), "pressure or force"
     header, rows, lines = cells.header, cells.rows, cells.lines
@@ -95,6 +95,11 @@ def read_pump_table(
     if len(outside):
         line = lines[kept[int(outside[0])]]
         raise BadInputError(f"{shown(path)}, line {line}: PWM is {u[outside[0]]:g}, expected 0 to 255")
+    if 0.0 < float(u.max()) <= 1.0:
+        raise BadInputError(
+            f"{shown(path)}: PWM is {float(u.max()):.3g} at most, expected 0 to 255; where it is a share of "
+            "the full duty, multiply the column by 255"
+        )
     back = np.nonzero(np.diff(t) < 0.0)[0]
     if len(back):
         line = lines[kept[int(back[0]) + 1]]
