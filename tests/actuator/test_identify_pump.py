@@ -16,6 +16,7 @@ from calib.stages.actuator.identify_pump import (
     LAG,
     MODELS,
     ORIFICE,
+    PumpFit,
     PumpFound,
     PumpRecord,
     PumpTable,
@@ -137,6 +138,26 @@ def test_the_level_has_a_sigma_that_holds_from_run_to_run(levels: tuple[float, .
     assert wide.sigma["level"] >= fit.sigma["level"]
     assert between < 0.1 if len(set(levels)) == 1 else 2.0 < between < 5.0
     assert wide.sigma["level"] == pytest.approx(math.hypot(fit.sigma["level"], between))
+
+
+def test_runs_whose_controller_hides_their_level_widen_its_sigma() -> None:
+    """All end at 22 kPa, at the PWM that holds it; how they rise tells 30 from 36 kPa."""
+    runs = []
+    for k, level in enumerate((30.0, 36.0, 30.0, 36.0)):
+        pwm = np.where(0.8 + 0.1 * k <= T, 255.0 * 22.0 / level, _step())
+        clean = simulate_pump(LAG, np.array([0.05, level, 0.6, FREE]), _record(pwm), start_s=-1.0)
+        runs.append(PumpRecord(f"run{k}", T, pwm, clean + 0.05 * np.sin(37.0 * T + k)))
+    fit = fit_pump(runs, LAG)
+    assert 2.0 < with_run_sigma(fit, cross_validate(fit, runs))[1] < 8.0
+
+
+def test_a_run_settles_where_as_much_flows_in_as_leaks_out() -> None:
+    theta = np.array([0.05, 40.0, 0.3, 0.01, 2.0, 0.0, 1.0])
+    fit = PumpFit(ORIFICE, theta, ("level",), {"level": 5.0}, np.eye(1), 0.0, 0.0, Shape())
+    long = PumpRecord("run", 0.1 * np.arange(300), np.full(300, 255.0), np.zeros(300))
+    at, sigma = fit.settles(3.0)
+    assert at == pytest.approx(fit.run(long, -1.0)[-1], abs=1e-3)
+    assert 3.0 < sigma < 5.0
 
 
 @pytest.mark.slow

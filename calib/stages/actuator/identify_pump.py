@@ -323,6 +323,36 @@ class PumpFit:
         """All parameters by name."""
         return dict(zip([p.name for p in MODELS[self.model]], self.theta.tolist(), strict=True))
 
+    def settles(self, between: float = 0.0) -> tuple[float, float]:
+        """Where a run settles at full PWM, and its deviation.
+
+        Parameters
+        ----------
+        between : standard deviation of the level from run to run, which its `sigma` has in it.
+        """
+
+        def at(theta: FloatArray) -> float:
+            if self.model == LAG:
+                return float(theta[1])
+            # What flows in leaks out, w = p / T_leak.
+            _, g, a, b, leak_s, *_ = theta.tolist()
+            half = 1.0 + a / leak_s
+            return 2.0 * g / (half + math.sqrt(half * half + 4.0 * b * g / leak_s**2))
+
+        names = [p.name for p in MODELS[self.model]]
+        slopes, spread = np.zeros(len(self.fitted)), np.zeros(len(self.fitted))
+        for k, name in enumerate(self.fitted):
+            j, more = names.index(name), self.theta.copy()
+            more[j] += _STEP * self.theta[j]
+            slopes[k] = (at(more) - at(self.theta)) / (_STEP * self.theta[j]) if self.theta[j] else 0.0
+            added = between if name == "level" else 0.0
+            spread[k] = math.sqrt(max(self.sigma[name] ** 2 - added**2, 0.0))
+        level = slopes[self.fitted.index("level")]
+        part = slopes * spread
+        return at(self.theta), math.hypot(
+            math.sqrt(max(part @ self.correlation @ part, 0.0)), level * between
+        )
+
     def run(self, record: PumpRecord, start_s: float = _START_S) -> FloatArray:
         """Values (n,) of `simulate_pump`."""
         return simulate_pump(self.model, self.theta, record, self.shape, start_s)
@@ -333,13 +363,15 @@ class Held:
     """Errors on a recording that was not fitted: free run, and `_AHEAD_S` ahead of measured values.
 
     `settles` is by how much it ends above the free run, over its last second; NaN where it does not run near
-    full PWM then.
+    full PWM then. `level` is by how much another level would explain the whole run better; 0 where it hardly
+    runs at a PWM that tells.
     """
 
     name: str
     rms: float
     ahead: float
     settles: float = math.nan
+    level: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -633,9 +665,17 @@ def cross_validate(fit: PumpFit, records: Sequence[PumpRecord]) -> list[Held]:
 
 def held_by(fit: PumpFit, record: PumpRecord) -> Held:
     """Errors of a fit on a recording that it has not seen."""
-    late, off = _near_full(record), record.value - fit.run(record)
+    run, late = fit.run(record), _near_full(record)
+    off = record.value - run
     settles = float(np.mean(off[late])) if late is not None else math.nan
-    return Held(record.name, rms(off), rms_ahead(fit, record), settles)
+    # A controller lowers the PWM of a run whose level is high, so that its end does not tell.
+    at = [p.name for p in MODELS[fit.model]].index("level")
+    more = fit.theta.copy()
+    more[at] *= 1.0 + _LITTLE
+    rises = (replace(fit, theta=more).run(record) - run) / (_LITTLE * fit.theta[at])
+    tells = float(np.mean(rises**2)) > _FOLLOWS**2
+    level = float(rises @ off) / float(rises @ rises) if tells else 0.0
+    return Held(record.name, rms(off), rms_ahead(fit, record), settles, level)
 
 
 def _near_full(record: PumpRecord) -> BoolArray | None:
@@ -649,12 +689,13 @@ def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
     """The fit with a level whose deviation holds for a further run, and what runs add to it.
 
     Runs of one pump settle apart for reasons that no PWM tells. How the samples of a run scatter says nothing
-    of that; by how much held runs end off their prediction does. NaN for fewer than two.
+    of that; by how much held runs end off their prediction does, or are off it as a whole. NaN for fewer than
+    two.
     """
-    ends = np.array([one.settles for one in held if math.isfinite(one.settles)])
-    if len(ends) < 2 or "level" not in fit.sigma:
+    if len(held) < 2 or "level" not in fit.sigma:
         return fit, math.nan
-    between = rms(ends)
+    off = [max(abs(one.level), 0.0 if math.isnan(one.settles) else abs(one.settles)) for one in held]
+    between = float(np.sqrt(np.mean(np.square(off))))
     sigma = {**fit.sigma, "level": math.hypot(fit.sigma["level"], between)}
     return replace(fit, sigma=sigma), between
 
@@ -663,6 +704,9 @@ def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
 # What a pump's model cannot explain: runs that settle apart at the same PWM, and where runs leave it.
 
 _SETTLED_S = 1.0
+_LITTLE, _FOLLOWS = 0.01, 0.5
+"""Change of a level, as a part of it, that tells how a run follows it; what of it a run has to follow (RMS)
+to tell a level."""
 _APART = 0.05
 _LONG_S = 0.3
 _STEADY_PWM = 3.0
@@ -895,8 +939,8 @@ class PumpFound:
         return rms(np.array(some)) if some else None
 
     def settles(self, model: str) -> tuple[float, float, int, int] | None:
-        """Level, half its 95 % interval for a further run, and how many of the held runs end inside that
-        which the others give, of how many; None where fewer than three were held.
+        """Where a further run settles at full PWM, half its 95 % interval, and how many of the held runs end
+        inside that which the others give, of how many; None where fewer than three were held.
 
         Three deviations hold 95 % of any distribution with one peak (Vysochanskij and Petunin 1980).
         """
@@ -908,8 +952,8 @@ class PumpFound:
             <= 3.0 * math.hypot(*(other for j, other in enumerate(ends) if j != k)) / math.sqrt(len(ends) - 1)
             for k, end in enumerate(ends)
         )
-        fit = self.fits[model]
-        return fit.values["level"], 3.0 * fit.sigma["level"], inside, len(ends)
+        at, sigma = self.fits[model].settles(self.between[model])
+        return at, 3.0 * sigma, inside, len(ends)
 
     @property
     def better(self) -> str | None:
@@ -1065,7 +1109,7 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
         level, half, inside, count = settles
         yield Finding(
             "remark",
-            f"a further run settles at {level:.1f} +- {half:.1f} {found.unit} at full PWM (95 %); "
+            f"a further run settles at {level:.1f} +- {half:.2g} {found.unit} at full PWM (95 %); "
             f"of {count} runs that were held back {inside} end inside what the others give",
         )
     if fit.shape.dead_pwm == 0.0:
