@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -240,6 +241,14 @@ def test_a_pump_that_is_a_lag_is_found_to_be_one(found: PumpFound) -> None:
     static = section.identified.static["static"]
     assert static.dead_pwm == pytest.approx(90.0, abs=4.0)
     assert set(section.identified.models) == {LAG, ORIFICE}
+
+
+@pytest.mark.slow
+def test_a_vacuum_pump_is_a_pump_that_counts_downward(found: PumpFound) -> None:
+    tables = [_table(replace(r, value=-r.value)) for r in pump_records(LAG, LAG_TRUTH, 3)]
+    drawn = identify_pump([*tables, PumpTable("kPa", None, (Settled("static", U, -25.0 * U / 255.0),), ())])
+    assert drawn.fits[LAG].values == pytest.approx(found.fits[LAG].values, rel=1e-6)
+    assert any("vacuum" in said for said in drawn.said)
 
 
 def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:

@@ -963,9 +963,12 @@ class PumpFound:
         return min(self.fits, key=lambda m: self.held_rms(m) or self.fits[m].rms)
 
 
-def _chosen_shape(records: Sequence[PumpRecord], maps: Sequence[StaticMap]) -> Shape:
-    """The static map's shape that lets the plain lag fit best: a straight line, or one of the tables'."""
-    rising = [m for m in maps if m.fit.end * float(np.median([r.value[-1] for r in records])) > 0.0]
+def _chosen_shape(records: Sequence[PumpRecord], maps: Sequence[StaticMap], sign: float) -> Shape:
+    """The static map's shape that lets the plain lag fit best: a straight line, or one of the tables'.
+
+    The records' values are `sign` times the tables'.
+    """
+    rising = [m for m in maps if sign * m.fit.end * float(np.median([r.value[-1] for r in records])) > 0.0]
     shapes = [Shape(), *(m.shape for m in rising)]
     if len(shapes) == 1:
         return shapes[0]
@@ -1000,6 +1003,14 @@ def identify_pump(
             said.append(f"{record.name}: neither PWM nor value ever changes; left out")
             continue
         records.append(record)
+    outside = [table.record for table in kept_out if table.record is not None]
+    # The models' flow goes in: what a vacuum pump draws out is counted downward.
+    sign = -1.0 if records and all(float(np.mean(r.value)) < 0.0 for r in records) else 1.0
+    if sign < 0.0:
+        said.append(
+            "values are below zero, as behind a vacuum pump: what follows counts downward from zero"
+        )
+        records, outside = ([replace(r, value=-r.value) for r in some] for some in (records, outside))
     settled = [part for table in tables for part in table.settled]
     maps = [fit_static_map(part.name, part.pwm, part.value) for part in settled]
     if not records and not maps:
@@ -1009,14 +1020,13 @@ def identify_pump(
     asked: dict[str, list[Held]] = {}
     between: dict[str, float] = {}
     if records:
-        shape = _chosen_shape(records, maps)
+        shape = _chosen_shape(records, maps, sign)
         for done, model in enumerate(MODELS):
             if progress is not None:
                 progress(done, len(MODELS))
             fits[model] = fit_pump(records, model, shape)
             held[model] = cross_validate(fits[model], records)
             fits[model], between[model] = with_run_sigma(fits[model], held[model])
-            outside = [table.record for table in kept_out if table.record is not None]
             asked[model] = [held_by(fits[model], r) for r in outside]
     return PumpFound(
         units.pop(),
