@@ -363,15 +363,15 @@ class Held:
     """Errors on a recording that was not fitted: free run, and `_AHEAD_S` ahead of measured values.
 
     `settles` is by how much it ends above the free run, over its last second; NaN where it does not run near
-    full PWM then. `level` is by how much another level would explain the whole run better; 0 where it hardly
-    runs at a PWM that tells.
+    full PWM then. `level` is by how much another level would explain the whole run better; NaN where it
+    hardly runs at a PWM that tells.
     """
 
     name: str
     rms: float
     ahead: float
     settles: float = math.nan
-    level: float = 0.0
+    level: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -674,7 +674,7 @@ def held_by(fit: PumpFit, record: PumpRecord) -> Held:
     more[at] *= 1.0 + _LITTLE
     rises = (replace(fit, theta=more).run(record) - run) / (_LITTLE * fit.theta[at])
     tells = float(np.mean(rises**2)) > _FOLLOWS**2
-    level = float(rises @ off) / float(rises @ rises) if tells else 0.0
+    level = float(rises @ off) / float(rises @ rises) if tells else math.nan
     return Held(record.name, rms(off), rms_ahead(fit, record), settles, level)
 
 
@@ -692,9 +692,10 @@ def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
     of that; by how much held runs end off their prediction does, or are off it as a whole. NaN for fewer than
     two.
     """
-    if len(held) < 2 or "level" not in fit.sigma:
+    told = [[abs(x) for x in (one.settles, one.level) if math.isfinite(x)] for one in held]
+    off = [max(one) for one in told if one]
+    if len(off) < 2 or "level" not in fit.sigma:
         return fit, math.nan
-    off = [max(abs(one.level), 0.0 if math.isnan(one.settles) else abs(one.settles)) for one in held]
     between = float(np.sqrt(np.mean(np.square(off))))
     sigma = {**fit.sigma, "level": math.hypot(fit.sigma["level"], between)}
     return replace(fit, sigma=sigma), between
@@ -1007,9 +1008,7 @@ def identify_pump(
     # The models' flow goes in: what a vacuum pump draws out is counted downward.
     sign = -1.0 if records and all(float(np.mean(r.value)) < 0.0 for r in records) else 1.0
     if sign < 0.0:
-        said.append(
-            "values are below zero, as behind a vacuum pump: what follows counts downward from zero"
-        )
+        said.append("values are below zero, as behind a vacuum pump: what follows counts downward from zero")
         records, outside = ([replace(r, value=-r.value) for r in some] for some in (records, outside))
     settled = [part for table in tables for part in table.settled]
     maps = [fit_static_map(part.name, part.pwm, part.value) for part in settled]
