@@ -45,9 +45,10 @@ def track(
     noise: float = 1.0,
     seed: int = 0,
     delay_s: float = 0.025,
+    nominal: Machine | None = None,
 ) -> Track:
     """A track from `open_loop.simulate` with steps of its own: "free", "steps" or "prbs"."""
-    nominal = Machine()
+    nominal = nominal or Machine()
     n = round(duration_s / TICK_S)
     plant, pump = made(nominal, {**values_of(nominal), **(values or {})}, kind != "free", TICK_S)
     start = rig_at_rest(plant, pump, phi_rad if kind == "free" else 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -435,6 +436,20 @@ def test_recovery_with_the_pumps_connected(tmp_path: Path) -> None:
         z += np.linalg.solve(L, [value - truth[name] for name, value in found.values.items()]).tolist()
     assert np.mean(np.abs(z) < 1.96) >= 0.9
     assert np.abs(z).max() < 3.0
+
+
+def test_an_orifice_is_found_from_springs_that_the_limited_rate_has_bent() -> None:
+    """Under a limited rate the springs come out at .29 of the nominal, and the rate is not told."""
+    known = Machine()
+    true = replace(known, pump=replace(known.pump, deflation=Orifice(1.2, 0.001)))
+    tracks = [track("prbs", duration_s=20.0, nominal=true), track("free", nominal=true)]
+    found = fit_tracks(known, tracks, either_law=True)
+    assert "air leaves by an orifice" in found.law
+    assert found.values["stiffness_scale"] == pytest.approx(1.0, abs=0.02)
+    assert found.values["laminar_s"] == pytest.approx(1.2, abs=0.03)
+    said = [one.text for one in judge(found, uncertainty(found), colour_of(found), [], []).findings]
+    untold = r"\(turbulent\) is .* \+- .*: these logs do not tell it from zero"
+    assert any(re.search(untold, text) for text in said)
 
 
 @pytest.mark.parametrize(

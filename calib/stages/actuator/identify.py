@@ -951,21 +951,22 @@ def _by_the_better_law(solution: Solution) -> Solution:
     """The solution with a limited rate, or that with an orifice where it explains the logs far better."""
     problem = solution.problem
     limited, orifice = {"falling_N_per_s"}, {"laminar_s", "turbulent_s2_per_N"}
-    if not limited <= {*problem.names} or (limited | orifice) & {*problem.stated}:
+    # Under the wrong law the rate may not have been told at all.
+    names, fixed = _reopened(solution)
+    if not limited <= names or (limited | orifice) & {*problem.stated}:
         return solution
     nominal = replace(problem.nominal, pump=replace(problem.nominal.pump, deflation=Orifice()))
-    names, fixed = _reopened(solution)
     other = replace(problem, nominal=nominal, names=_ordered((names - limited) | orifice), held={})
     known = values_of(nominal)
     near = {**known, **problem.held, **solution.values}
     rough = replace(other, rough=True)
-    if not solve(rough, _moved(solution, rough, near), 25)[1] < solution.cost:
+    # The wrong law may have bent the forces so far that no way leads back.
+    bases = near, known
+    if not min(solve(rough, _moved(solution, rough, one), 25)[1] for one in bases) < solution.cost:
         return solution
-    best = _again(solution, other, near, fixed)
+    best = min((_again(solution, other, one, fixed) for one in bases), key=lambda one: one.cost)
     if not best.cost < _BETTER * solution.cost:
         return solution
-    # The wrong law may have bent the forces so far that no way leads back.
-    best = min(best, _again(solution, other, known, fixed), key=lambda one: one.cost)
     share = f"{100.0 * best.cost / solution.cost:.0f} %"
     law = f"air leaves by an orifice, which leaves {share} of the misfit (known: pump: deflation decides)"
     return replace(best, law=law)
@@ -1932,7 +1933,10 @@ def judge(
     for name, value in solution.values.items():
         relative = known.sigma[name] / max(abs(value), 1e-12)
         if relative > _MOST_RELATIVE:
-            out.append(Finding("poor", f"{label_of(name)} is known to {100.0 * relative:.0f} % only"))
+            so = f"known to {100.0 * relative:.0f} % only"
+            if relative > 1.0:
+                so = f"{value:.3g} +- {known.sigma[name]:.2g}: these logs do not tell it from zero"
+            out.append(Finding("poor", f"{label_of(name)} is {so}"))
     out += [*_of_fit(solution, known, colours), *_apart(solution, known)]
     for log in held:
         # A log that alone tells a parameter is predicted badly by the others, who say nothing against it.
