@@ -415,13 +415,13 @@ def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Sc
         means = [mean_of(errors, name) for name in ("angle_by_pressure_rad", "angle_rad")]
         return next((x for x in means if math.isfinite(x)), math.inf)
 
-    best = held_fits(trials, assembly, scale)
+    best = last = held_fits(trials, assembly, scale)
+    least = _WORTHWHILE * error(best)
     for finer in _FINER:
         other = replace(scale, finer=finer)
-        held = held_fits(trials, assembly, other, best)
-        if error(held) > _WORTHWHILE * error(best):
-            break
-        scale, best = other, held
+        last = held_fits(trials, assembly, other, last)
+        if (reached := error(last)) <= least:
+            scale, best, least = other, last, reached
     return scale, best
 
 
