@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from calib.stages.arm.identify import (
 )
 from calib.stages.arm.model import PARAMETERS, Assembly, Trial, begun, segment_run, values_on
 from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
+from calib.stages.arm.stage import _far
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +91,17 @@ def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -
 
 # ----------------------------------------------------------------------
 # The file.
+
+
+@pytest.mark.parametrize(("error_deg", "severity"), [(1.2, "remark"), (4.0, "poor")])
+def test_a_trial_apart_is_poor_where_it_matters(error_deg: float, severity: str) -> None:
+    """Of a range of 57 deg, and others that are predicted to 0.4 deg."""
+    errors = {"a": error_deg, "b": 0.4, "c": 0.4, "d": 0.4}
+    held = {name: {"angle_rad": math.radians(error)} for name, error in errors.items()}
+    found = SimpleNamespace(held=held, fit=SimpleNamespace(scale=replace(SCALE, angle_rad=1.0)))
+    (finding,) = _far(found)
+    assert finding.severity == severity
+    assert finding.text.startswith(f"a is predicted to {error_deg:.1f} deg from the others")
 
 
 def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:

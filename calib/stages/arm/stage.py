@@ -26,6 +26,8 @@ _UNTOLD = 0.8
 """Posterior over prior deviation above which logs tell nothing of a parameter."""
 _FAR = 2.0
 """A held trial is far from the others with this many times their median error."""
+_ODD = 0.05
+"""Of the angle's range: an error far from the others' that is smaller only widens the interval of a trial."""
 _COARSE = 0.1
 """Error of a held trial, of the angle's range, above which a prediction is none."""
 _MATTERS = 0.005
@@ -229,7 +231,7 @@ def _far(found: Identification) -> Iterator[Finding]:
         usual = others[len(others) // 2]
         if error - usual >= _LEAST_RAD and error > _FAR * usual:
             yield Finding(
-                "poor",
+                "poor" if error > _ODD * found.fit.scale.angle_rad else "remark",
                 f"{name} is predicted to {math.degrees(error):.1f} deg from the others, which reach "
                 f"{math.degrees(usual):.1f} deg: it alone holds its day, load or range",
                 f"record another trial like {name}",
