@@ -296,6 +296,16 @@ def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:
     assert found.fit.values["stiffens_per_kpa"] < 2e-4
 
 
+@pytest.mark.slow
+def test_a_regulator_that_follows_its_command_is_a_lag() -> None:
+    follows = FULL.without("creep", "load").driven_by("lag")
+    true = follows.values(np.full(len(PARAMETERS), 0.3), SCALE)
+    found = identify([simulated(f"a_{k}", k, values=true) for k in range(3)], compare=False)
+    assert "lag" in found.fit.assembly.parts
+    by_valve = mean_of(found.others["a valve for the lag"], "angle_rad")
+    assert mean_of(found.held, "angle_rad") < 0.8 * by_valve
+
+
 def test_units_that_no_arm_has_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)

@@ -514,17 +514,25 @@ def identify(
     assembly = FULL if any(one.load_kg > 0.0 for one in trials) else FULL.without("load")
     if any(one.pwm for one in trials):
         assembly = assembly.driven_by("lag")
+    scale, held = _held(trials, assembly, scale) if len(trials) > 1 else (scale, {})
+    errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
+    others: dict[str, Mapping[str, Errors]] = {}
+    if held and "valve" in assembly.parts and any(len(one.command) for one in trials):
+        # A regulator that follows its command is none of the valves that integrate.
+        lag = assembly.driven_by("lag")
+        fits = held_fits(trials, lag, scale, held)
+        by_lag = {one.name: errors_of(fits[one.name], one) for one in trials}
+        if mean_of(by_lag, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
+            others["a valve for the lag"] = errors
+            assembly, held, errors = lag, fits, by_lag
+        else:
+            others["a lag for the valve"] = by_lag
     variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}
-    if "valve" in assembly.parts and any(len(one.command) for one in trials):
-        variants["a lag for the valve"] = assembly.driven_by("lag")
     chosen = variants if compare and len(trials) > 1 else {}
     steps = 2 + len(chosen)
-    scale, held = _held(trials, assembly, scale) if len(trials) > 1 else (scale, {})
     progress(1, steps)
     made = fit(trials, assembly, scale)
-    errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
     progress(2, steps)
-    others: dict[str, Mapping[str, Errors]] = {}
     for k, (name, other) in enumerate(chosen.items()):
         fits = held_fits(trials, other, scale, held)
         others[name] = {one.name: errors_of(fits[one.name], one) for one in trials}
