@@ -337,7 +337,7 @@ class PumpFit:
             # What flows in leaks out, w = p / T_leak.
             _, g, a, b, leak_s, *_ = theta.tolist()
             half = 1.0 + a / leak_s
-            return 2.0 * g / (half + math.sqrt(half * half + 4.0 * b * g / leak_s**2))
+            return float(2.0 * g / (half + math.sqrt(half * half + 4.0 * b * g / leak_s**2)))
 
         names = [p.name for p in MODELS[self.model]]
         slopes, spread = np.zeros(len(self.fitted)), np.zeros(len(self.fitted))
@@ -347,11 +347,9 @@ class PumpFit:
             slopes[k] = (at(more) - at(self.theta)) / (_STEP * self.theta[j]) if self.theta[j] else 0.0
             added = between if name == "level" else 0.0
             spread[k] = math.sqrt(max(self.sigma[name] ** 2 - added**2, 0.0))
-        level = slopes[self.fitted.index("level")]
         part = slopes * spread
-        return at(self.theta), math.hypot(
-            math.sqrt(max(part @ self.correlation @ part, 0.0)), level * between
-        )
+        own = math.sqrt(max(float(part @ self.correlation @ part), 0.0))
+        return at(self.theta), math.hypot(own, float(slopes[self.fitted.index("level")]) * between)
 
     def run(self, record: PumpRecord, start_s: float = _START_S) -> FloatArray:
         """Values (n,) of `simulate_pump`."""
@@ -696,7 +694,7 @@ def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
     off = [max(one) for one in told if one]
     if len(off) < 2 or "level" not in fit.sigma:
         return fit, math.nan
-    between = float(np.sqrt(np.mean(np.square(off))))
+    between = rms(np.array(off))
     sigma = {**fit.sigma, "level": math.hypot(fit.sigma["level"], between)}
     return replace(fit, sigma=sigma), between
 
