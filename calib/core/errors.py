@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+from typing import Any
+
 EXIT_DONE = 0
 EXIT_POOR = 1
 """Done and written, but the result fails its quality gate."""
@@ -35,6 +38,14 @@ def one_line(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def package(name: str, needed: str) -> Any:
+    """A module of a package that not everybody has. Raises `BadInputError` with what is needed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise BadInputError(needed) from error
 
 
 class BadInputError(CalibError):

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
-from calib.core.errors import BadInputError, CalibError, pip_install
+from calib.core.errors import BadInputError, CalibError, package, pip_install
 from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown
 from calib.io.columns import COLUMNS, Block, Passed
 
@@ -196,17 +196,16 @@ def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
 
 def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
     """The fields that one entry of the file asks for."""
+    known = wanted in _PRESETS if isinstance(wanted, str) else isinstance(wanted, dict) and wanted
+    if not known:
+        raise BadInputError(f"{where} is {quoted(wanted)}, expected {', '.join(_PRESETS)} or columns")
     if isinstance(wanted, str):
-        if wanted not in _PRESETS:
-            raise BadInputError(f"{where} is {quoted(wanted)}, expected {', '.join(_PRESETS)} or columns")
         columns = _preset(wanted, topic)
         if columns is None:
             raise BadInputError(
                 f"{where} is of type {one_line(topic.kind)[:60]}, expected {_EXPECTED[wanted]}"
             )
         return _fields(columns)
-    if not isinstance(wanted, dict) or not wanted:
-        raise BadInputError(f"{where} is {quoted(wanted)}, expected {', '.join(_PRESETS)} or columns")
     fields = []
     for column, path in wanted.items():
         if column not in COLUMNS:
@@ -637,14 +636,9 @@ def opened_bag(path: Path) -> Iterator[Source]:
         raise BadInputError(f"{source}: is not a bag that can be read: {said}") from error
 
 
-def _module(path: Path, name: str, package: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        what = f"reading {path.suffix.lstrip('.') or 'bags'}"
-        raise BadInputError(
-            f"{shown(path)}: {what} needs the package {package}: {pip_install('logs')}"
-        ) from error
+def _module(path: Path, name: str) -> Any:
+    what, of = f"reading {path.suffix.lstrip('.') or 'bags'}", name.split(".")[0]
+    return package(name, f"{shown(path)}: {what} needs the package {of}: {pip_install('logs')}")
 
 
 def _kind(name: str) -> str:
@@ -675,8 +669,8 @@ def _rosbag(path: Path) -> Iterator[Source]:
         raise BadInputError(
             f"{shown(path)}: is a folder without metadata.yaml, expected a log or a ROS 2 bag"
         )
-    reader = _module(path, "rosbags.highlevel", "rosbags")
-    typesys = _module(path, "rosbags.typesys", "rosbags")
+    reader = _module(path, "rosbags.highlevel")
+    typesys = _module(path, "rosbags.typesys")
     # Bags older than ROS 2 Iron do not say how their messages are made up.
     known = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     packing = check_folder_of_bag(path) if path.is_dir() else ""
@@ -697,8 +691,8 @@ class _Mcap:
     def __init__(self, path: Path, stream: Any) -> None:
         self._path, self._stream = path, stream
         self.truncated = False
-        reader = _module(path, "mcap.reader", "mcap")
-        self._errors = _module(path, "mcap.exceptions", "mcap")
+        reader = _module(path, "mcap.reader")
+        self._errors = _module(path, "mcap.exceptions")
         self._make = {
             True: lambda: reader.SeekingReader(stream, record_size_limit=MOST_BYTES),
             False: lambda: reader.NonSeekingReader(stream, record_size_limit=MOST_BYTES),
@@ -767,7 +761,7 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
     if schema.encoding not in encodings[channel.message_encoding]:
         found = one_line(f"{schema.encoding}")[:40]
         raise BadInputError(f"{where} has a schema in {found!r}, expected ros2msg, ros2idl or ros1msg")
-    typesys = _module(path, "rosbags.typesys", "rosbags")
+    typesys = _module(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.EMPTY)
     text = schema.data.decode("utf-8")
     name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/", 1)
@@ -785,6 +779,6 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
 
 @contextmanager
 def _mcap(path: Path) -> Iterator[Source]:
-    _module(path, "mcap.reader", "mcap")
+    _module(path, "mcap.reader")
     with BoundedFile(path) as stream:
         yield _Mcap(path, stream)

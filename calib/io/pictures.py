@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import os
 import re
@@ -20,7 +19,7 @@ import cv2
 import numpy as np
 
 from calib.core.arrays import AnyArray, GrayImage
-from calib.core.errors import BadInputError, pip_install
+from calib.core.errors import BadInputError, package, pip_install
 from calib.core.files import PICTURES, read_bytes, sha256, shown, to_be
 
 # ----------------------------------------------------------------------
@@ -247,12 +246,8 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
 
 def _heic(data: bytes, where: str) -> AnyArray | None:
     """A HEIC picture, turned back to the sensor's own rows: its decoder holds it upright."""
-    try:
-        pillow_heif = importlib.import_module("pillow_heif")
-    except ImportError as error:
-        raise BadInputError(
-            f"{where}: reading HEIC needs the package pillow-heif: {pip_install('pictures')}"
-        ) from error
+    needed = f"{where}: reading HEIC needs the package pillow-heif: {pip_install('pictures')}"
+    pillow_heif = package("pillow_heif", needed)
     try:
         image = pillow_heif.open_heif(data, convert_hdr_to_8bit=True).to_pillow()
         decoded = np.asarray(image.convert("L"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from typing import IO, Any
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError, pip_install
+from calib.core.errors import BadInputError, package, pip_install
 from calib.core.files import shown
 from calib.core.writing import Kind, column_names, head, replacing
 from calib.io.tables import GENERAL, TIME, WHOLE, table_bytes
@@ -66,10 +65,8 @@ def _mcap(path: Path, stream: IO[bytes], names: tuple[str, ...]) -> Iterator[Add
 
     Raises `BadInputError` without the extra logs, and for a time before zero, which MCAP cannot tell.
     """
-    try:
-        writer: Any = importlib.import_module("mcap.writer").Writer(stream)
-    except ImportError as error:
-        raise BadInputError(f"{shown(path)}: writing MCAP needs mcap: {pip_install('logs')}") from error
+    needed = f"{shown(path)}: writing MCAP needs mcap: {pip_install('logs')}"
+    writer: Any = package("mcap.writer", needed).Writer(stream)
     pose_at = tuple(names.index(name) for name in ("x_m", "y_m", "phi_rad"))
     writer.start(library="calib")
     # A column that is not known in a row is null there.

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import ConfigDict, Field, PrivateAttr
 
-from calib.core.errors import BadInputError
+from calib.core.errors import BadInputError, package
 from calib.core.result import Count, Number, Result, Section, Sigma, quantity
 from calib.core.words import BLANK, Block, Table
 
@@ -218,10 +217,7 @@ class Replayed(Result):
 
     def to_pandas(self) -> Any:
         """The states as a pandas DataFrame. Raises `BadInputError` without pandas."""
-        try:
-            pandas = importlib.import_module("pandas")
-        except ImportError as error:
-            raise BadInputError("a table for pandas needs pandas: pip install pandas") from error
+        pandas = package("pandas", "a table for pandas needs pandas: pip install pandas")
         return pandas.DataFrame(self.states, columns=list(self.columns))
 
     def save(self, path: str | Path) -> None:
