@@ -480,3 +480,80 @@ def test_a_plant_that_cannot_be_is_named(calib: Run, rig: Path, ellipse: Path) -
     refused = calib("replay", str(ellipse), "--rig", str(rig))
     assert refused.code == 3
     assert "pump.lag_s" in refused.err
+
+
+def _captured(log: Log, noise_m: float = 3e-4) -> dict[str, FloatArray | None]:
+    """The tip by motion capture in the rows of the pictures, which go, with the truth in its own columns."""
+    seen, noise = np.isfinite(log.columns["u_px"]), np.random.default_rng(5)
+    columns = {"tip_x_m": "true_x_m", "tip_y_m": "true_y_m", "tip_phi_rad": "true_phi_rad"}
+    pose = {name: np.where(seen, log.columns[true], np.nan) for name, true in columns.items()}
+    for name, sigma in zip(pose, (noise_m, noise_m, 0.005), strict=True):
+        pose[name] = pose[name] + sigma * noise.standard_normal(len(log))
+    return {"u_px": None, "v_px": None, **pose}
+
+
+def test_the_place_of_the_tip_stands_in_for_pictures(
+    calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path
+) -> None:
+    """Nobody knows the base to a hair: sigma holds 0.3 mm for the tip and 0.2 mm for the base."""
+    log, columns = logs["ellipse"], _captured(logs["ellipse"])
+    assert columns["tip_y_m"] is not None
+    columns["tip_y_m"] += 3e-4
+    path, states = _put(tmp_path, "captured", log, **columns), tmp_path / "states.csv"
+    done = calib("replay", path, "--rig", rig, "-o", states, "--figures", tmp_path / "figures", "--json")
+    assert done.code == 0, done.err
+    (told,) = json.loads(done.out)["replay"]["logs"]
+    assert set(told["sensors"]) == {"pose", "accel", "gyro"}
+    assert told["jitter_px"] is None
+    assert told["pose_noise_mm"] == pytest.approx(0.3, rel=0.2)
+    q = np.genfromtxt(states, delimiter=",", names=True)
+    late = q["t_s"] > 2.0
+    for name in ("q1_m", "q2_m"):
+        error = (q[name] - log.columns[f"true_{name}"])[late]
+        sigma = np.sqrt(np.mean(q[f"sigma_{name}"][late] ** 2))
+        assert 0.5 * sigma < np.sqrt(np.mean(error**2)) < 1.5 * sigma < 6e-4
+    assert calib("replay", path, "--rig", rig, "--tune").code == 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("mirrored", "off the arc from the base"),
+        ("frozen", "stays the same to the digit from 3.0 to 6.0 s"),
+        ("millimetres", "look at the unit of tip_x_m and tip_y_m"),
+        ("space", "expected tip_x_m, tip_y_m without tip_z_m"),
+    ],
+)
+def test_a_pose_that_is_not_what_it_says_is_told(
+    calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path, fault: str, told: str
+) -> None:
+    log = logs["ellipse"]
+    columns, t = _captured(log), log.t_s
+    x, y = columns["tip_x_m"], columns["tip_y_m"]
+    assert x is not None and y is not None
+    if fault == "mirrored":
+        columns["tip_x_m"] = -x
+    elif fault == "frozen":
+        held = np.isfinite(x) & (t >= 3.0) & (t <= 6.02)
+        x[held], y[held] = x[held][0], y[held][0]
+    elif fault == "millimetres":
+        columns |= {"tip_x_m": 1e3 * x, "tip_y_m": 1e3 * y}
+    else:
+        columns |= {"tip_z_m": 0.0 * x} | dict.fromkeys(("ax_mps2", "ay_mps2", "gz_radps"))
+    done = calib("replay", _put(tmp_path, fault, log, **columns), "--rig", rig, "--model", "kinematic")
+    assert done.code == (3 if fault in ("millimetres", "space") else 1)
+    assert told in done.out + done.err
+
+
+def test_a_pose_beside_pictures_scores_the_states(
+    calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path
+) -> None:
+    log = logs["ellipse"]
+    pose = {name: column for name, column in _captured(log).items() if column is not None}
+    done = calib(
+        "replay", _put(tmp_path, "both", log, **pose), "--rig", rig, "--model", "kinematic", "--json"
+    )
+    (told,) = json.loads(done.out)["replay"]["logs"]
+    assert 0.25 < told["rmse"]["mean_q_mm"] < 0.6
+    assert "nees" not in told["rmse"]
+    assert "errors are against the tip's pose and hold its noise and delay" in told["remarks"]

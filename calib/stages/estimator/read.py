@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, rms, runs
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import LogOptions
@@ -18,6 +18,7 @@ from calib.core.result import CovarianceTable
 from calib.core.rig import Rig
 from calib.io.logs import Log, iter_log, refuse_counts, unclipped
 from calib.solve.clock import time_axis
+from calib.stages.actuator.kinematics import inverse
 from calib.stages.actuator.section import Standing
 from calib.stages.align.section import SENSORS_OF
 from calib.stages.estimator.baseline import BaselineSetup, undistorting_nothing
@@ -36,6 +37,14 @@ from calib.stages.estimator.sensors import QUANTITIES, SENSOR, sensor_values, vi
 
 READINGS = ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")
 """Columns of `kinematic.Rows.readings`."""
+PLACE = ("place_x_mm", "place_y_mm")
+"""What stands for the first two of them in a log without pictures: the tip's place against the base by motion
+capture, which `blocks` adds to its columns."""
+_TIP, _BASE = ("tip_x_m", "tip_y_m"), ("base_x_m", "base_y_m")
+_PER_M = 1e3
+_SOME, _STUCK_S = 25, 1.0
+_REACH = (0.3, 3.0)
+"""Distance of tip and base over the length at rest; no bellows is so short or so long."""
 _TRUTH = ("true_q1_m", "true_q2_m", "true_phi_rad")
 
 
@@ -51,6 +60,7 @@ class Periods:
     ticks : whether rows with commands and without IMU are ticks of the camera's clock.
     camera, imu : samples.
     command_s : distance of commands [s], NaN where they are not as steady as a loop's.
+    pose : whether the tip's place stands for pictures.
     """
 
     camera_s: float
@@ -62,6 +72,12 @@ class Periods:
     camera_even: bool = True
     imu_even: bool = True
     command_s: float = math.nan
+    pose: bool = False
+
+
+def seen_by(log: Log) -> tuple[str, ...]:
+    """Columns of a block of `blocks` that `kinematic.Rows.readings` are taken from."""
+    return (*(PLACE if PLACE[0] in log.columns else READINGS[:2]), *READINGS[2:])
 
 
 def _column(log: Log, name: str) -> FloatArray:
@@ -79,7 +95,7 @@ def _kinds(log: Log, readings: FloatArray, ticks: bool) -> tuple[BoolArray, Bool
 
 
 def _readings(log: Log) -> FloatArray:
-    values = np.stack([_column(log, name) for name in READINGS], axis=1)
+    values = np.stack([_column(log, name) for name in seen_by(log)], axis=1)
     return np.where(np.isfinite(values), values, np.nan)
 
 
@@ -100,9 +116,10 @@ def periods(log: Log) -> Periods:
     steps = np.diff(log.t_s[np.isfinite(_column(log, "pwm1"))])
     usual = float(np.median(steps)) if len(steps) else math.nan
     steady = bool(np.mean(np.abs(steps / usual - 1.0) < 0.5) > _STEADY) if usual > 0.0 else False
+    pose = PLACE[0] in log.columns
     return Periods(
-        first.period_s, second.period_s, grid_px(readings), use, int(seen.sum()), int(imu.sum()),
-        first.steady, second.steady, usual if steady else math.nan,
+        first.period_s, second.period_s, 0.0 if pose else grid_px(readings), use, int(seen.sum()),
+        int(imu.sum()), first.steady, second.steady, usual if steady else math.nan, pose,
     )  # fmt: skip
 
 
@@ -114,32 +131,153 @@ def rows_of(log: Log, ticks: bool) -> Rows:
     return Rows(np.asarray(log.t_s, dtype=np.float64), readings, kinds)
 
 
-def truth_of(log: Log) -> FloatArray | None:
-    """True q1, q2 [m] and phi [rad] (n, 3), None for a log that does not know them."""
-    if any(name not in log.columns for name in _TRUTH):
+def truth_of(log: Log, setup: Setup) -> FloatArray | None:
+    """True q1, q2 [m] and phi [rad] (n, 3), None for a log that does not know them.
+
+    Beside pictures the tip's pose by motion capture is taken for true where nothing truer is there and the
+    tip is within reach.
+    """
+    if all(name in log.columns for name in _TRUTH):
+        return np.stack([log.columns[name] for name in _TRUTH], axis=1)
+    if not scored_by_pose(log):
         return None
-    return np.stack([log.columns[name] for name in _TRUTH], axis=1)
+    pose = np.column_stack([_place_m(log), log.columns["tip_phi_rad"]])
+    near, far = (share * float(setup.start.head[1]) for share in _REACH)
+    distance = np.hypot(pose[:, 0], pose[:, 1])
+    pose[~((distance > near) & (distance < far) & (np.abs(pose[:, 2]) < 2.0 * math.pi))] = np.nan
+    out = np.full((len(log), 3), np.nan)
+    known = np.isfinite(pose).all(axis=1)
+    out[known] = np.column_stack([inverse(pose[known], setup.bellows_radius_m), pose[known, 2]])
+    return out
 
 
-def blocks(path: Path, options: LogOptions, picture_px: tuple[int, int] | None) -> Iterator[Log]:
+def scored_by_pose(log: Log) -> bool:
+    """Whether a block has pictures, no truth, and the tip's pose in the plane."""
+    return (
+        PLACE[0] not in log.columns
+        and any(name not in log.columns for name in _TRUTH)
+        and _in_plane(log)
+        and "tip_phi_rad" in log.columns
+    )
+
+
+def _in_plane(log: Log) -> bool:
+    return all(name in log.columns for name in _TIP) and "tip_z_m" not in log.columns
+
+
+def _place_m(log: Log) -> FloatArray:
+    """The tip's place (n, 2) [m] against the base."""
+    base = [log.columns.get(name, np.zeros(len(log))) for name in _BASE]
+    return np.stack([log.columns[name] for name in _TIP], axis=1) - np.stack(base, axis=1)
+
+
+def bend_apart_rad(log: Log) -> float:
+    """RMS [rad] between the tip's angle and that of an arc from the base to its place; NaN without both.
+
+    Of medians over some poses each, so that neither noise nor jumps count.
+    """
+    if not _in_plane(log) or "tip_phi_rad" not in log.columns:
+        return math.nan
+    away = log.columns["tip_phi_rad"] - 2.0 * np.arctan2(*_place_m(log).T)
+    away = away[np.isfinite(away)]
+    parts = np.array_split(away, max(len(away) // _SOME, 1))
+    return rms(np.array([np.median(part) for part in parts])) if len(away) else math.nan
+
+
+def stuck_place(log: Log) -> tuple[float, float, float] | None:
+    """The time from and to [s] in which the tip's place repeats to the digit for longest, and by how much the
+    gyroscope turns meanwhile [rad]; None where none repeats for a second or the gyroscope is silent.
+    """
+    seen, turning = log.sampled(*PLACE), log.sampled("gz_radps")
+    if len(seen) < 2 or len(turning) < 2:
+        return None
+    place, t = np.stack([log.columns[name][seen] for name in PLACE]), log.t_s[seen]
+    same = runs((place[:, 1:] == place[:, :-1]).all(axis=0))
+    first, last = max(((t[a], t[b]) for a, b in same), key=lambda one: one[1] - one[0], default=(0.0, 0.0))
+    if not last - first >= _STUCK_S:
+        return None
+    rate, at = log.columns["gz_radps"][turning], log.t_s[turning]
+    turned = np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(at))])
+    inside = turned[(at >= first) & (at <= last)]
+    return float(first), float(last), float(np.ptp(inside)) if len(inside) else 0.0
+
+
+def _placed(log: Log) -> Log:
+    """A block with the columns `PLACE`."""
+    columns = dict(zip(PLACE, _PER_M * _place_m(log).T, strict=True))
+    return replace(log, columns={**log.columns, **columns})
+
+
+def _check_reach(log: Log, rest_length_m: float) -> None:
+    """Raise `BadInputError` where the tip is too near to or too far from the base for these bellows."""
+    far = float(np.nanmedian(np.hypot(*_place_m(log).T)))
+    if not _REACH[0] * rest_length_m <= far <= _REACH[1] * rest_length_m:
+        raise BadInputError(
+            f"{log.source}: the tip is {1e3 * far:.4g} mm from the base, expected about the rest length, "
+            f"{1e3 * rest_length_m:.4g} mm; look at the unit of tip_x_m and tip_y_m, and state the base as "
+            "base_x_m, base_y_m"
+        )
+
+
+def blocks(
+    path: Path, options: LogOptions, picture_px: tuple[int, int] | None, rest_length_m: float = math.nan
+) -> Iterator[Log]:
     """Blocks with rows of a log; `options` and `picture_px` as for `iter_log`.
 
-    Raises `BadInputError` for one without rows, camera and IMU.
+    Where the first has no picture and the tip's place in the plane, all get the columns `PLACE`.
+
+    Raises `BadInputError` for one without rows, or without camera, pose and IMU, and for a tip that is not
+    within reach of bellows of this length at rest.
     """
-    rows, known = 0, False
+    rows, known, pose = 0, False, False
     for block in iter_log(path, options, picture_px=picture_px):
-        if not known and not any(name in block.columns for name in READINGS):
+        if not known and not any(name in block.columns for name in (*READINGS, *_TIP)):
             raise BadInputError(
                 f"{shown(path)}: has neither camera nor IMU, expected columns as u_px, v_px or gz_radps"
             )
         if not known:
             refuse_counts(block, READINGS)
+            pose = (
+                _in_plane(block) and not len(block.sampled(*READINGS[:2])) and len(block.sampled(*_TIP)) > 0
+            )
+            if pose:
+                _check_reach(block, rest_length_m)
+            elif not any(name in block.columns for name in READINGS):
+                raise BadInputError(
+                    f"{shown(path)}: has neither camera nor IMU and no tip in the plane of motion, expected "
+                    "tip_x_m, tip_y_m without tip_z_m"
+                )
         known = True
         if len(block):
             rows += len(block)
-            yield unclipped(block)
+            yield unclipped(_placed(block) if pose else block)
     if rows == 0:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
+
+
+_CAPTURED = ("marker_offset_m", "time_offset_s", "shift_x_m", "shift_y_m", "stretch")
+"""Quantities of the picture; of motion capture they are nothing, as far as anybody knows."""
+
+
+def _of_capture(
+    values: dict[str, tuple[float, float]], covariance: FloatArray | None
+) -> tuple[dict[str, tuple[float, float]], FloatArray | None]:
+    """Values and covariance of the sensors where the tip's place stands for pictures."""
+    values = values | {name: (0.0, QUANTITIES[name].assumed) for name in _CAPTURED}
+    if covariance is not None:
+        at = [SENSOR.index(name) for name in _CAPTURED]
+        covariance = covariance.copy()
+        covariance[at], covariance[:, at] = 0.0, 0.0
+        covariance[at, at] = [QUANTITIES[name].assumed ** 2 for name in _CAPTURED]
+    return values, covariance
+
+
+def _place_view() -> FloatArray:
+    """A view (25,) of `sensors.view_coefficients` that shows places in the plane in mm."""
+    view = np.zeros(25)
+    view[[0, 4, 8]] = 1.0
+    view[[9, 10]] = _PER_M
+    return view
 
 
 def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | None, list[str]]:
@@ -315,7 +453,9 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     source = shown(path)
     said: list[str] = []
     view = np.zeros(25)
-    if found.camera:
+    if found.pose:
+        view = _place_view()
+    elif found.camera:
         plane = rig.current_plane(str(path))
         if rig.camera is None:
             raise BadInputError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
@@ -325,6 +465,8 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
         view = view_coefficients(rig.camera.optics, R, t, rig.middle_m)
     values, covariance, assumed = _from_align(rig)
     said += assumed
+    if found.pose:
+        values, covariance = _of_capture(values, covariance)
     plant = rig.plant
     head = np.array([0.0, plant.rest_length_m + 0.004, 0.0, 0.0, 0.0, 0.0])
     start = Start(

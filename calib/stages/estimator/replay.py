@@ -51,6 +51,7 @@ from calib.stages.estimator.read import (
     READINGS,
     Periods,
     baseline_setup,
+    bend_apart_rad,
     blocks,
     drive_from_rig,
     has_commands,
@@ -58,7 +59,10 @@ from calib.stages.estimator.read import (
     periods,
     pwm_of,
     rows_of,
+    scored_by_pose,
+    seen_by,
     setup_from_rig,
+    stuck_place,
     truth_of,
 )
 from calib.stages.estimator.section import Errors, Held, Replayed, SensorCheck
@@ -209,14 +213,14 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
 
     Raises `BadInputError` for a log or a rig that cannot be used.
     """
-    stream = blocks(path, options, rig.picture_px)
+    stream = blocks(path, options, rig.picture_px, rig.plant.rest_length_m)
     first = next(stream)
     found = periods(first)
     setup, remarks = setup_from_rig(rig, rig_path, found)
     if first.map is not None and first.map.narration:
         remarks.append(first.map.narration)
     stated = rig.estimator is not None or (rig.align is not None and rig.align.jitter_px > 0.0)
-    if found.camera and not stated:
+    if found.camera and (found.pose or not stated):
         part = rows_of(first, found.ticks)[:_JITTER_ROWS]
         setup = with_jitter(setup, jitter_px(setup, [part]).value)
     return OpenLog(path, setup, found, first, _noted(chain([first], stream), remarks), remarks)
@@ -323,7 +327,7 @@ def filterpy_log(log: OpenLog, stream: Iterable[Log]) -> tuple[FloatArray, Float
     parts, truths = [], []
     for block in stream:
         parts.append(rows_of(block, log.periods.ticks))
-        truth = truth_of(block)
+        truth = truth_of(block, log.setup)
         truths.append(np.full((len(block), 3), np.nan) if truth is None else truth)
     out, apart = replayed(log.setup, joined(parts))
     text = f"the compiled filter with the same one level of noise is at most {apart:.0e} sigma away"
@@ -335,7 +339,7 @@ def smooth_log(setup: Setup, ticks: bool, stream: Iterable[Log], drive: Drive | 
     parts, outs, truths, pwm, driven, kinematic = [], [], [], [], [], []
     fused, both = Filter(setup), None if drive is None else Handover(setup, drive)
     for log in stream:
-        rows, truth = rows_of(log, ticks), truth_of(log)
+        rows, truth = rows_of(log, ticks), truth_of(log, setup)
         parts.append(rows)
         if both is None:
             outs.append(fused.run(rows))
@@ -416,7 +420,7 @@ class Sums:
 
     fused: Tally
     baseline: Tally
-    watch: Watch = field(default_factory=lambda: Watch(READINGS))
+    watch: Watch
     trace: Trace | None = None
     weighed: int = 0
     driven: int = 0
@@ -456,6 +460,8 @@ _OF_CAMERA, _FEWEST = 0.4, 100
 them, the correlation stayed within .22; where a column was not what it said it was .56 to 1."""
 _AWAY = 3.2
 """Deviations: one of eight quantities is off by as much in one of a hundred logs at most."""
+_PLACES = {"camera": "pictures", "pose": "poses"}
+"""Names of what sees the place, and words for its readings."""
 _CALIBRATED = {
     "gyro_bias_radps": ("the gyroscope's bias", 1e-3),
     "accel_bias_x_mps2": ("the accelerometer's bias along x", 0.03),
@@ -473,11 +479,13 @@ _FLAGGED_SHARE = _LATE_SHARE = 0.05
 
 def sampled(watch: Watch) -> Iterator[Finding]:
     """Findings on sensors that are not there, do not move, or contradict each other."""
-    camera, gyro, accel = (watch.has(*names) for names in (READINGS[:2], READINGS[4:], READINGS[2:4]))
+    sensors = watch.names[:2], watch.names[4:], watch.names[2:4]
+    camera, gyro, accel = (watch.has(*names) for names in sensors)
     if not camera:
         yield Finding("poor", "the log has no pictures: the length is known from the prior alone")
     if not (gyro or accel):
-        yield Finding("poor", "the log has no IMU samples: angle and length come from the camera alone")
+        what = "the camera" if sensors[0] == READINGS[:2] else "the tip's place"
+        yield Finding("poor", f"the log has no IMU samples: angle and length come from {what} alone")
     elif not gyro:
         yield Finding("poor", "the log has no gyroscope (gz_radps)")
     elif not accel:
@@ -492,21 +500,22 @@ def consistent(checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows
             ratio = check.nis / check.degrees
             if not 1.0 / (2.0 * _NIS_FACTOR) <= ratio <= _NIS_FACTOR:
                 # A marker that rests on one pixel says so again and again.
-                quiet = name == "camera" and ratio < 1.0
+                quiet = name in _PLACES and ratio < 1.0
                 yield Finding(
                     "remark" if quiet else "poor",
-                    f"the innovations of the {name} are {ratio:.2g} times what the covariance expects; "
-                    "calib replay --tune learns the noise of this rig",
+                    f"the innovations of the {name} are {ratio:.2g} times what the covariance expects"
+                    + ("" if name == "pose" else "; calib replay --tune learns the noise of this rig"),
                 )
             if check.inside < _INSIDE_SHARE:
                 share = f"{100.0 * check.inside:.0f} % of the {name}'s innovations"
                 yield Finding("poor", f"only {share} lie in their 95 % band")
-            if name == "camera" and check.readings >= _FEWEST and abs(check.correlation) > _OF_CAMERA:
+            if name in _PLACES and check.readings >= _FEWEST and abs(check.correlation) > _OF_CAMERA:
                 yield Finding(
                     "poor",
-                    "the pictures contradict the IMU: their innovations repeat, "
+                    f"the {_PLACES[name]} contradict the IMU: their innovations repeat, "
                     f"{check.correlation:.2f} with the one before",
-                    "check the columns of this log: their order, signs, units and times",
+                    "check the columns of this log: their order, signs, units and times"
+                    + (", and where the base is" if name == "pose" else ""),
                 )
             elif abs(check.correlation) > _CORRELATED:
                 value = f"{check.correlation:.2f}"
@@ -520,6 +529,7 @@ def consistent(checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows
     # A sensor that is not in the log has a sentence of its own.
     for flag, sentence, here in (
         ("camera_silent", "the camera is silent", "camera" in checks),
+        ("camera_silent", "the motion capture is silent", "pose" in checks),
         ("imu_silent", "the IMU is silent", bool({"accel", "gyro"} & set(checks))),
         ("held_by_prior", "no sensor bounds length or angle, the prior does", True),
         ("not_started", "nothing is known yet", True),
@@ -538,7 +548,9 @@ def consistent(checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows
         yield Finding(severity, f"{late} readings came too late to be used")
 
 
-def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterator[Finding]:
+def contradicting(
+    setup: Setup, sensor: FloatArray, duration_s: float, place: str = "pictures"
+) -> Iterator[Finding]:
     """Findings on what the log says of the sensors against what their calibration does.
 
     The calibration's error and the sensor's walk over the log bound how far the two may be apart, however
@@ -556,6 +568,7 @@ def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterat
         k = SENSOR.index(name)
         away = float(sensor[k] - before[6 + k])
         if not abs(away) <= max(_AWAY * float(sigma[k]), least):
+            words = words.replace("pictures", place)
             unit = {"radps": " rad/s", "mps2": " m/s^2", "rad": " rad", "s": " s"}.get(
                 name.rsplit("_", 1)[-1], ""
             )
@@ -565,6 +578,33 @@ def contradicting(setup: Setup, sensor: FloatArray, duration_s: float) -> Iterat
                 "its sigma",
                 "check the columns of this log, or run calib align again",
             )
+
+
+_NO_ARC_RAD = math.radians(3.0)
+"""A tip that is 1 mm beside its place turns the arc of 65 mm by 1.8 degrees."""
+
+
+def captured(first: Log, pose: bool) -> Iterator[Finding]:
+    """Findings where the tip's angle is not that of the arc from the base to its place, and where that stands
+    still while the gyroscope turns; `pose` where it stands for pictures.
+    """
+    apart = bend_apart_rad(first)
+    if apart > _NO_ARC_RAD:
+        yield Finding(
+            "poor" if pose else "remark",
+            f"tip_phi_rad is {math.degrees(apart):.1f} degrees (RMS) off the arc from the base to tip_x_m, "
+            "tip_y_m",
+            "look at their order, signs and units: x and phi grow to one side, y from the base along the "
+            "straight actuator",
+        )
+    stuck = stuck_place(first) if pose else None
+    if stuck is not None and stuck[2] > _NO_ARC_RAD:
+        yield Finding(
+            "poor",
+            f"the tip's place stays the same to the digit from {stuck[0]:.1f} to {stuck[1]:.1f} s, in which "
+            f"the gyroscope turns by {math.degrees(stuck[2]):.0f} degrees",
+            "the motion capture has lost the tip: leave these cells blank",
+        )
 
 
 _SEARCHED_ROWS = 2000
@@ -591,7 +631,7 @@ def _moving(rows: Rows) -> Rows:
     return rows[first : first + _SEARCHED_ROWS]
 
 
-def untimely(setup: Setup, rows: Rows) -> Iterator[Finding]:
+def untimely(setup: Setup, rows: Rows, place: str = "pictures") -> Iterator[Finding]:
     """A finding where other times of some column make a part of the log much likelier.
 
     Each of `_TOGETHER` is moved by some samples, and the kinematic filter runs again; a move that gains goes
@@ -630,7 +670,9 @@ def untimely(setup: Setup, rows: Rows) -> Iterator[Finding]:
         period_ms = 1e3 * float(np.median(np.diff(rows.t_s[np.isfinite(rows.readings[:, 2:]).any(axis=1)])))
         best = max(value for value, _ in found.values())
         told = [
-            _TOGETHER[names].format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
+            _TOGETHER[names]
+            .format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
+            .replace("pictures", place)
             for names, (value, shift) in sorted(found.items(), key=lambda item: -item[1][0])
             if value > best - _GAIN
         ]
@@ -679,11 +721,12 @@ def replay_log(
         compile_filters(False, smoothed)
         log = opened(path, rig, rig_path, options)
     fused = estimator != "baseline"
-    if not fused and not log.both:
+    if not fused and (not log.both or log.periods.pose):
         raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
     drive = drive_for(log, rig, model)
     radius_m = log.setup.bellows_radius_m
-    sums = Sums(Tally(radius_m), Tally(radius_m), trace=Trace() if figures else None)
+    watch = Watch(seen_by(log.first))
+    sums = Sums(Tally(radius_m), Tally(radius_m), watch, trace=Trace() if figures else None)
     columns = STATES if fused else BASELINE
     kept: list[FloatArray] = []
     compared: dict[str, Errors] = {}
@@ -707,7 +750,8 @@ def replay_log(
                 compared["filter"] = filtered.rmse()
             write(whole.out[:, _COLUMNS])
         else:
-            baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if log.both else None
+            pictures = log.both and not log.periods.pose
+            baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if pictures else None
             estimate = Estimate(log.setup, drive, model)
             _stream(log, estimate, baseline, fused, sums, write, progress)
             sensor = estimate.sensor
@@ -736,7 +780,7 @@ def _unstated(rig: Rig) -> list[Finding]:
 
 def _taken(log: OpenLog, driven: bool) -> list[str]:
     """Sections that states of this log follow from."""
-    optics = ["camera", "plane"] if log.periods.camera else []
+    optics = ["camera", "plane"] if log.periods.camera and not log.periods.pose else []
     inertial = ["imu", "align"] if log.periods.imu else []
     return [*optics, *inertial, *(["actuator", "pump"] if driven else []), "estimator"]
 
@@ -767,7 +811,7 @@ def _stream(
 
     def finish(item: tuple[Log, Rows, FloatArray]) -> None:
         block, rows, out = item
-        truth, held = truth_of(block), None
+        truth, held = truth_of(block, log.setup), None
         if baseline is not None and (truth is not None or sums.trace is not None or not fused):
             held = baseline.run(rows)
         sums.watch.add(block)
@@ -797,7 +841,10 @@ def _replayed(
 ) -> Replayed:  # fmt: skip
     """Judge, and put together what is shown."""
     tally, own = sums.fused, estimator != "baseline"
-    checks = {name: check for name in SENSORS if (check := tally.check(name)) is not None}
+    camera = "pose" if log.periods.pose else "camera"
+    place = _PLACES[camera]
+    named = {name: camera if name == "camera" else name for name in SENSORS}
+    checks = {named[name]: check for name in SENSORS if (check := tally.check(name)) is not None}
     flags = {name: tally.flags[bit] for name, bit in FLAGS.items() if tally.flags.get(bit)}
     share = sums.driven / sums.weighed if own and sums.weighed else None
     if own:
@@ -806,25 +853,33 @@ def _replayed(
         # A sensor that is stuck or mirrored seems late, too; innovations that are white hide no delay.
         repeats = any((check.correlation or 0.0) > _REPEATING for check in checks.values())
         if repeats and all(one.severity != "inconsistent" for one in seen):
-            findings += untimely(log.setup, rows_of(log.first, log.periods.ticks))
+            findings += untimely(log.setup, rows_of(log.first, log.periods.ticks), place)
+        findings += captured(log.first, log.periods.pose)
         findings += consistent(checks, flags, max(tally.rows, 1))
         if not tally.end_s - tally.start_s >= SETTLED_S:
             text = f"the log is too short: innovations are judged from {SETTLED_S:g} s on"
             findings.append(Finding("poor", text))
         if sensor is not None:
-            findings += contradicting(log.setup, sensor, tally.end_s - tally.start_s)
+            findings += contradicting(log.setup, sensor, tally.end_s - tally.start_s, place)
     if share is not None and share < 0.99:
         rest = f"in {100.0 * (1.0 - share):.0f} % of the rows the kinematic model spoke"
         findings.append(Finding("remark", f"{rest}, which explained them better"))
     assumed = [Finding("remark", text) for text in log.remarks]
+    rmse = tally.rmse() if own else _lengths_and_angle(sums.baseline)
+    if scored_by_pose(log.first):
+        rmse.pop("nees", None)
+        text = "errors are against the tip's pose and hold its noise and delay"
+        none = "the tip's pose is nowhere within reach, in m and rad from the base: nothing was scored"
+        assumed.append(Finding("remark", text if rmse else none))
     return Replayed(
         source=shown(log.path.name),
         rows=tally.rows,
         duration_s=finite_or_none(tally.end_s - tally.start_s) or 0.0,
         estimator=estimator,
         driven_share=share,
-        jitter_px=float(log.setup.noise[0]) if log.periods.camera else None,
-        rmse=tally.rmse() if own else _lengths_and_angle(sums.baseline),
+        jitter_px=None if log.periods.pose or not log.periods.camera else float(log.setup.noise[0]),
+        pose_noise_mm=float(log.setup.noise[0]) if log.periods.pose else None,
+        rmse=rmse,
         compared=compared,
         sensors=checks if own else {},
         flags=flags if own else {},

@@ -179,6 +179,7 @@ class Replayed(Result):
     driven_share : of the rows, in which the driven model speaks; null where there is none.
     rmse, compared : errors against the truth, of this estimator and of others.
     sensors : consistency by sensor. flags : rows by flag. jitter_px : of the tracker, that was used.
+    pose_noise_mm : of the tip's place where that stands for pictures, in either direction.
     """
 
     source: str = quantity(label="log")
@@ -187,6 +188,7 @@ class Replayed(Result):
     estimator: str = quantity(label="estimator")
     driven_share: Number | None = quantity(None, label="driven model speaks in", show="%", digits=0)
     jitter_px: Number | None = quantity(None, label="tracker's jitter", digits=2)
+    pose_noise_mm: Number | None = quantity(None, label="noise of the tip's place", digits=2)
     rmse: Errors = {}
     compared: dict[str, Errors] = {}
     sensors: dict[str, SensorCheck] = quantity({}, label="sensor")

@@ -144,7 +144,7 @@ replay = Stage(
     _read,
     _solve,
     ReplayOptions,
-    sources="Logs of camera and IMU.",
+    sources="Logs of camera and IMU, or of motion capture in place of the camera.",
     metavar="LOG...",
     output=Output(
         "States to write, .csv, .parquet or .mcap; with several logs a folder, made if needed.", None

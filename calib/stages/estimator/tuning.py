@@ -73,7 +73,7 @@ def tuned_section(
     drive = drive_from_rig(bare)
     for path in logs:
         source = opened(path, bare, rig_path, options)
-        if not source.both:
+        if not source.both or source.periods.pose:
             raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
         parts, commands, count = [], [], 0
         for log in source.stream:
