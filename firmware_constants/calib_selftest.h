@@ -135,7 +135,7 @@ static const uint16_t calib_selftest_words[CALIB_SELFTEST_TICKS * 2] CALIB_IN_FL
     7, 1920, 7, 1920, 7, 640, 6, 641, 7, 1920, 5, 1924, 7, 1280, 7, 640,
     7, 1920, 7, 64, 11, 1024, 11, 1536, 11, 1536, 11, 512, 11, 512, 11, 512,
     11, 1536, 11, 1536, 43, 1536, 1898, 1537, 10, 33, 11, 1536, 43, 1536, 1897, 1540,
-    9, 36, 11, 1536, 43, 1536, 1866, 1537, 43, 1536, 11, 1536, 11, 1537, 11, 1537,
+    9, 36, 11, 1536, 43, 1536, 1858, 1, 43, 1536, 11, 1536, 11, 1537, 11, 1537,
     11, 1540, 11, 1536, 11, 1540, 11, 1540, 11, 1537, 11, 1536, 11, 1536, 11, 513,
     11, 1536, 11, 512, 11, 513, 11, 513, 11, 1536, 11, 1536, 11, 1540, 11, 1540,
     11, 1540, 11, 1536, 11, 1540, 11, 64, 11, 64, 11, 1536, 11, 64, 11, 64,
@@ -145,9 +145,9 @@ static const uint16_t calib_selftest_words[CALIB_SELFTEST_TICKS * 2] CALIB_IN_FL
 
 /* state.count after them. */
 #if CALIB_FUSED
-static const uint16_t calib_selftest_counts[CALIB_COUNTERS] CALIB_IN_FLASH = {152, 0, 71, 4, 5, 321, 0};
+static const uint16_t calib_selftest_counts[CALIB_COUNTERS] CALIB_IN_FLASH = {152, 0, 71, 4, 5, 262, 0};
 #else
-static const uint16_t calib_selftest_counts[CALIB_COUNTERS] CALIB_IN_FLASH = {152, 0, 71, 4, 5, 321, 0};
+static const uint16_t calib_selftest_counts[CALIB_COUNTERS] CALIB_IN_FLASH = {152, 0, 71, 4, 5, 262, 0};
 #endif
 
 /* One over the tolerances of phi, marker, head, lengths and PWM; uneven, so that no two errors hide each other. */

@@ -98,7 +98,8 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     # A picture that is left out is none, and the pumps do not go on for it.
     boost = int(constants.get("CALIB_FUSED_BOOST_TICKS", 0))
     away = replace(still, u_px=_elsewhere(still.u_px))
-    made += [(still, boost + 2), (replace(still, marker_seen=False), hold - 1), (away, 2), (still, 1)]
+    lost = replace(still, marker_seen=False, mode=MODE_OFF)
+    made += [(still, boost + 2), (lost, hold - 1), (away, 2), (still, 1)]
     weak = {
         f"a{axis}_mps2": 0.9 * constants["CALIB_IMU_ACCEL_WEAK_MPS2"]
         + constants[f"CALIB_IMU_ACCEL_BIAS_{name}"]
