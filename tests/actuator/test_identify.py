@@ -273,6 +273,7 @@ def test_deviations_are_those_of_repeated_logs() -> None:
     assert np.all((ratio > 0.45) & (ratio < 1.7))
 
 
+@pytest.mark.slow
 def test_a_creep_that_is_not_there_is_left_at_none(tmp_path: Path) -> None:
     """Kept at its nominal 10 N/m the springs make up for it: 16 to 30 % off, 50 to 80 deviations."""
     rig_yaml = tmp_path / "rig.yaml"
@@ -456,7 +457,7 @@ def test_an_orifice_is_found_from_springs_that_the_limited_rate_has_bent() -> No
     ("law", "seed"),
     [
         (RateLimit(0.35), 1),
-        (Orifice(0.9, 1.3), 1),
+        pytest.param(Orifice(0.9, 1.3), 1, marks=pytest.mark.slow),
         pytest.param(Orifice(0.9, 1.3), 3, marks=pytest.mark.slow),
     ],
 )

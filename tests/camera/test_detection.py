@@ -188,7 +188,7 @@ def _error(detection: Detection | None, truth: FloatArray) -> FloatArray:
         (VGA, (9, 6), PARALLEL, 0.3, "as taken"),
         # Squares of 200 px, which are averaged over blocks where edges are blurred.
         pytest.param(LARGE, (4, 3), PARALLEL, 0.3, "as taken", marks=pytest.mark.slow),
-        (LARGE, (4, 3), PARALLEL, 0.7, "as taken"),
+        pytest.param(LARGE, (4, 3), PARALLEL, 0.7, "as taken", marks=pytest.mark.slow),
         pytest.param(LARGE, (4, 3), None, 3.0, "as taken", marks=pytest.mark.slow),
         (VGA, (9, 6), None, 0.7, "sharpened 1 px"),
         (VGA, (9, 6), PARALLEL, 0.7, "sharpened 2 px"),

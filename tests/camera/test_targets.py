@@ -29,12 +29,8 @@ def _pictures(drawing: Drawing, count: int, blur_px: float) -> tuple[list[np.nda
     return pictures, [inner_corners(drawing, *p) for p in poses]
 
 
-_OTHERS = ("before OpenCV 4.6", "thin margins", "AprilTags")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(one, marks=[pytest.mark.slow] if one in _OTHERS else []) for one in BOARDS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BOARDS)
 def test_corners_against_truth_and_opencv(name: str) -> None:
     """Boards cut by the border: more corners than OpenCV finds, each at most half as far off."""
     drawing, blur_px = BOARDS[name]

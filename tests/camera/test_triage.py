@@ -177,7 +177,7 @@ def test_pictures_of_a_bent_board_are_not_turned(bow: float) -> None:
     "recipe",
     [
         Recipe(0.03, aspect=1.005),
-        Recipe(0.03, bow_m=5e-4),
+        pytest.param(Recipe(0.03, bow_m=5e-4), marks=pytest.mark.slow),
         pytest.param(Recipe(0.03, aspect=0.998), marks=pytest.mark.slow),
     ],
 )
