@@ -514,6 +514,18 @@ def test_readings_are_corrected_by_what_is_written(counts: bool) -> None:
     assert set(section.gyro.misalignment_rad) == {"yz", "zy", "xz", "zx", "xy", "yx"}
 
 
+def test_axes_that_six_faces_take_to_be_square_are_in_sigma() -> None:
+    turns = (("x", 0.0), ("x", 180.0), ("x", 90.0), ("x", 270.0), ("y", 90.0), ("y", 270.0))
+    faces = [Rotation.from_euler(axis, angle, degrees=True) for axis, angle in turns]
+    section = _section(pose_log([*faces, *faces[::-1], *faces[::2], *faces[1::2]], SENSOR))
+    assert section.gyro is not None
+    assert not section.accel.misalignment_rad
+    assert any("0.01 rad" in remark for remark in section.verdict.remarks)
+    for name, truth in zip(PLACES, SENSOR.gyro_angles, strict=True):
+        angle, sigma = section.gyro.misalignment_rad[name], section.gyro.sigma.misalignment_rad[name]
+        assert abs(angle - truth) < 3.0 * sigma
+
+
 class _Silent:
     """A source of random numbers that are all zero."""
 

@@ -975,6 +975,8 @@ def find_intrinsics(log: Readings, gravity_mps2: float, planar: bool = False) ->
 LIMITS = {"scale": 0.005, "bias_g": 0.005, "angle_rad": math.radians(0.5), "gyro": 0.01}
 """Largest standard deviations: relative scale, bias in g, misalignment, and those of the gyroscope."""
 
+_SQUARE_RAD = 0.01
+"""Deviation of an accelerometer's axes from right angles: data sheets allow 1 to 2 % of cross-axis share."""
 _USELESS = 20.0
 _NEAR = 0.5
 _LARGEST_RMS_G = 0.01
@@ -1056,7 +1058,8 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Find
     if not accel.skewed:
         yield Finding(
             "remark",
-            "the poses do not tell the accelerometer's misalignment; it is taken to be zero",
+            "the poses do not tell the accelerometer's misalignment; it is taken to be zero, and the "
+            f"gyroscope's, which are counted from its axes, hold to {_SQUARE_RAD:g} rad",
             "rests with two axes both at 45 degrees would show the misalignment",
         )
     if accel.dof <= 0:
@@ -1278,6 +1281,8 @@ def _gyroscope(result: Intrinsics, gyro: Gyroscope) -> GyroIntrinsics:
     known = np.isfinite(gyro.scale_sigma) & used & (result.foreign is None)
     angle_known = np.isfinite(gyro.angle_sigma) & (result.foreign is None)
     bias, names = gyro.bias, tuple(PLACES)
+    square = 0.0 if result.accel is not None and result.accel.skewed else _SQUARE_RAD
+    angle_sigma = np.where(angle_known, np.hypot(gyro.angle_sigma, square), math.nan)
     return GyroIntrinsics(
         unit="counts" if "g" in result.log.counts else "rad/s",
         bias=_three(np.where(used, bias.bias, math.nan)),
@@ -1286,7 +1291,7 @@ def _gyroscope(result: Intrinsics, gyro: Gyroscope) -> GyroIntrinsics:
         sigma=GyroSigma(
             bias=_three(np.where(used, bias.sigma, math.nan)),
             scale=_three(np.where(known, gyro.scale_sigma, math.nan)),
-            misalignment_rad=_named(names, np.where(angle_known, gyro.angle_sigma, math.nan)),
+            misalignment_rad=_named(names, angle_sigma),
             sensitivity=None if bias.sensitivity_sigma is None else _padded(bias.sensitivity_sigma),
         ),
         matrix=_padded(gyro.matrix) if known[used].all() else None,
