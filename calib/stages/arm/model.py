@@ -204,7 +204,7 @@ PARTS = (
     ),
     Part(
         "load",
-        (Parameter("compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.2, identified_by="a known load"),),
+        (Parameter("compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.7, True, identified_by="a known load"),),
         {"compliance_rad_per_Nm": 0.0},
     ),
     Part(
