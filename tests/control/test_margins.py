@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from control_models import NOMINAL, ORIFICE
+from control_models import NOMINAL, ORIFICE, UNLIKE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from open_loop import simulate
@@ -24,6 +24,7 @@ from calib.stages.control.tuning import (
     closed_loop,
     delay,
     holds,
+    largest_angle,
     loop_margins,
     orientation_loop,
     pid_system,
@@ -250,3 +251,19 @@ def test_the_limit_is_used(orientation: Tuned, position: Tuned) -> None:
             for point in tuned.points
         ]
         assert not all(kept)
+
+
+def test_unlike_pumps_keep_the_margins_to_both_sides() -> None:
+    """Tuned on the side of the weaker pump alone, the other side had a gain margin of 1.78."""
+    strongest = replace(UNLIKE, strength=UNLIKE.strength[::-1])
+    criterion = ControllerCriterion(gain_margin=2.0, phase_margin_rad=math.radians(60.0), sensitivity=2.0)
+    for model in (UNLIKE, strongest):
+        tuned = tune_orientation(model, criterion)
+        assert {point.q_m[0] > point.q_m[1] for point in tuned.points} == {True, False}
+        for share in (-0.6, 0.6):
+            phi = share * abs(largest_angle(model, int(share < 0.0)))
+            q1, q2 = bent_rest(model, phi).tolist()
+            (margins,) = loop_margins(orientation_loop(model, tuned.pid, (q1, q2)))
+            assert margins.gain > 1.95
+            assert margins.sensitivity < 2.05
+    assert largest_angle(UNLIKE) == pytest.approx(-largest_angle(strongest, 1), rel=1e-6)

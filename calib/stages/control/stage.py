@@ -320,6 +320,7 @@ def _check_document(checked: Checked) -> dict[str, Any]:
 
     reach = {
         "greatest_angle_rad": largest_angle(checked.model),
+        "least_angle_rad": largest_angle(checked.model, 1),
         "greatest_length_m": longest_m(checked.model),
         "greatest_force_N": largest_force_N(checked.model).tolist(),
     }
@@ -332,8 +333,12 @@ def _check_document(checked: Checked) -> dict[str, Any]:
 
 
 def _check_words(checked: Checked) -> list[Block]:
-    from calib.stages.control.tuning import largest_angle, longest_m
+    from calib.stages.control.tuning import largest_angle, longest_m, unlike
 
+    model = checked.model
+    bent = f"{largest_angle(model):.3f} rad"
+    if unlike(model):
+        bent = f"{largest_angle(model, 1):.3f} to {bent}"
     found, reference = checked.follow, checked.reference
     rise, fall = found.fastest_rise_N_per_s, found.fastest_fall_N_per_s
     moved = f"forces rise by up to {rise:.3g} N/s and fall by up to {abs(fall):.3g} N/s"
@@ -345,10 +350,7 @@ def _check_words(checked: Checked) -> list[Block]:
     )
     return [
         Line(f"{reference.name}: {reference.duration_s:g} s; {forces}"),
-        Line(
-            f"the pumps reach {1e3 * longest_m(checked.model):.2f} mm straight and "
-            f"{largest_angle(checked.model):.3f} rad bent; {start}"
-        ),
+        Line(f"the pumps reach {1e3 * longest_m(model):.2f} mm straight and {bent} bent; {start}"),
         *of_verdict(checked.verdict),
     ]
 

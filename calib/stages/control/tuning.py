@@ -322,17 +322,27 @@ def longest_m(model: Model) -> float:
     return float(brentq(over, low, high)) if over(high) > 0.0 else high
 
 
-def largest_angle(model: Model) -> float:
-    """Greatest angle [rad] that one pump alone can hold."""
-    low, high, most = 0.0, 1.5 * math.pi, float(largest_force_N(model)[0])
+def largest_angle(model: Model, pump: int = 0) -> float:
+    """Greatest angle [rad] that one pump alone can hold, to its side: below zero for the second."""
+    low, high, most = 0.0, 1.5 * math.pi, float(largest_force_N(model)[pump])
+    side = 1.0 if pump == 0 else -1.0
     for _ in range(40):
         middle = 0.5 * (low + high)
         try:
-            held = float(holding_force(model.plant, bent_rest(model, middle))[0]) <= most
+            held = float(holding_force(model.plant, bent_rest(model, side * middle))[pump]) <= most
         except BadInputError:
             held = False
         low, high = (middle, high) if held else (low, middle)
-    return low
+    return side * low
+
+
+_ALIKE = 0.01
+"""Between the pumps' strengths: less moves a margin by less than rounding the gains does (`_slack`)."""
+
+
+def unlike(model: Model) -> bool:
+    """Whether the pumps differ so much that each side counts by itself."""
+    return abs(math.log(model.strength[1] / model.strength[0])) > _ALIKE
 
 
 def approach_s(model: Model, q_m: FloatArray) -> float:
@@ -664,18 +674,25 @@ class Tuned:
 
 
 def operating_angles(model: Model) -> tuple[tuple[float, float], ...]:
-    """Rests (q1, q2) [m] at 15, 40, 65 and 90 % of the greatest angle, one pump alone."""
-    most = largest_angle(model)
-    rests = (bent_rest(model, share * most) for share in (0.15, 0.4, 0.65, 0.9))
+    """Rests (q1, q2) [m] at 15, 40, 65 and 90 % of the greatest angle, one pump alone.
+
+    To both sides where the pumps are unlike.
+    """
+    most = [largest_angle(model, pump) for pump in range(1 + unlike(model))]
+    rests = (bent_rest(model, share * one) for one in most for share in (0.15, 0.4, 0.65, 0.9))
     return tuple((float(q[0]), float(q[1])) for q in rests)
 
 
 def operating_lengths(model: Model) -> tuple[tuple[float, float], ...]:
-    """Rests (q1, q2) [m] at 10 to 95 % of the greatest elongation, and two that are bent."""
+    """Rests (q1, q2) [m] at 10 to 95 % of the greatest elongation, and two that are bent.
+
+    These to both sides where the pumps are unlike.
+    """
     rest = model.plant.rest_length_m
     span = longest_m(model) - rest
     found = [(rest + s * span, rest + s * span) for s in (0.1, 0.35, 0.65, 0.95)]
-    found += [(rest + a * span, rest + b * span) for a, b in ((0.75, 0.25), (0.9, 0.5))]
+    bent = [(rest + a * span, rest + b * span) for a, b in ((0.75, 0.25), (0.9, 0.5))]
+    found += bent + [(b, a) for a, b in bent if unlike(model)]
     return tuple(q for q in found if bool(reachable(model, np.array(q))))
 
 
