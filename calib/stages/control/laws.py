@@ -144,6 +144,8 @@ class Model:
     plant, pump : as identified.
     strength : factors on the static forces of the two pumps.
     low_pwm, high_pwm : limits of the command [PWM].
+    latency_s : from the exposure of a picture to the tick that reads it.
+    lowpass : second-order sections (b0, b1, b2, 1, a1, a2) of the board's low-pass; none for the usual one.
 
     Raises `BadInputError` for limits that the motors do not have or with which no pump gives any force.
     """
@@ -153,6 +155,8 @@ class Model:
     strength: tuple[float, float] = (1.0, 1.0)
     low_pwm: float = PWM_MIN
     high_pwm: float = PWM_MAX
+    latency_s: float = 0.025
+    lowpass: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         whole = float(self.low_pwm).is_integer() and float(self.high_pwm).is_integer()

@@ -451,6 +451,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
             raise UsageError(f"{what}: found {value:g}{unit}, expected {low:g} to {high:g}{unit}")
     criterion = ControllerCriterion(gain_margin=gain, phase_margin_rad=phase_rad, sensitivity=peak)
     machine, model = controlled(rig, options.pwm_limits)
+    # Of lowpass and align the delays alone count: an alignment with a poor mount angle spoils no gains.
     files.hashes |= rig.identities("known", "actuator", "pump")
     nominal = [name for name, values in rig.standing.items() if not values]
     return TuneInputs(machine, model, criterion, files.progress, nominal)
@@ -582,6 +583,6 @@ tune = Stage(
     _solve_tune,
     TuneOptions,
     writes=("controller",),
-    uses=("camera", "plane", "lowpass", "actuator", "pump", "twin"),
+    uses=("camera", "plane", "lowpass", "align", "actuator", "pump", "twin"),
     plots=later("calib.stages.control.plots", "tune_plots"),
 )

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -84,11 +85,18 @@ def controlled(rig: Rig, limits: Pair | None, other: Rig | None = None) -> tuple
     """
     machine, tick_s = rig_from_file(rig), 1.0 / rig.tick_hz
     machine = replace(machine, pump=machine.pump.at(tick_s))
-    model = control_model(machine, rig.controller, limits)
+    model = replace(control_model(machine, rig.controller, limits), **_sensed(rig, machine))
     if other is not None:
         own = other.machine
         machine = replace(machine, plant=own.plant, pump=own.pump.at(tick_s), strength=own.strength)
     return machine, model
+
+
+def _sensed(rig: Rig, machine: SimulatedRig) -> dict[str, Any]:
+    """What the board makes of pictures, by the sections `align` and `lowpass` where they are."""
+    late = machine.tracker.latency_s if rig.align is None else rig.align.time_offset_s
+    low = () if rig.lowpass is None else tuple((*one.b, *one.a) for one in rig.lowpass.sections)
+    return {"latency_s": max(late, 0.0), "lowpass": low}
 
 
 def control_model(rig: SimulatedRig, section: Controller | None = None, limits: Pair | None = None) -> Model:

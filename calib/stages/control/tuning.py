@@ -43,8 +43,8 @@ from calib.stages.control.section import ControllerCriterion
 # frequency response.
 
 
-_CUTOFF_HZ, _LATENCY_S = 1.0, 0.025
-"""Of the firmware's low-pass, and of the camera."""
+_CUTOFF_HZ = 1.0
+"""Of the firmware's usual low-pass."""
 
 
 @dataclass(frozen=True)
@@ -154,16 +154,21 @@ def rig_system(model: Model, q_m: FloatArray) -> System:
     return series(side_by_side(late, late), System(held[:8, :8], held[:8, 8:], C, np.zeros((2, 2)), h))
 
 
+_HAIR = 0.01
+"""Of a tick, by which pictures may be later than whole ticks: the time offset is hardly known better."""
+
+
 def firmware_sensing(model: Model) -> System:
     """Lengths (2,) as the firmware sees them: their mean late and low-passed, their difference at once."""
     from scipy.signal import butter
 
     h = model.tick_s
-    b, a = butter(1, _CUTOFF_HZ, fs=1.0 / h)
-    low = System(
-        np.array([[-a[1]]]), np.array([[1.0]]), np.array([[b[1] - b[0] * a[1]]]), np.array([[b[0]]]), h
-    )
-    length = series(delay(math.ceil(_LATENCY_S / h - 1e-9), h), low)
+    length = delay(math.ceil(model.latency_s / h - _HAIR), h)
+    sections = model.lowpass or butter(1, _CUTOFF_HZ, fs=1.0 / h, output="sos")
+    for b0, b1, b2, _, a1, a2 in sections:
+        A, B = np.array([[-a1, -a2], [1.0, 0.0]]), np.array([[1.0], [0.0]])
+        section = System(A, B, np.array([[b1 - b0 * a1, b2 - b0 * a2]]), np.array([[b0]]), h)
+        length = series(length, section)
     apart = gain(np.array([[0.5, 0.5], [0.5, -0.5]]), h)
     together = gain(np.array([[1.0, 1.0], [1.0, -1.0]]), h)
     return series(series(apart, side_by_side(length, gain(np.eye(1), h))), together)
