@@ -754,7 +754,8 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 # IMU's from the residuals, sum w r^2 / (n - d), where d = tr(W J P J') are the degrees of freedom that
 # the fit took from the sensor; the trace comes from random signs (Hutchinson 1990).
 
-_MOST_STEPS = 40
+_MOST_STEPS = 100
+"""Noise and fit follow each other: a change of the noise leaves three quarters of it to the next, or less."""
 _HALVINGS = 8
 _SMALL_STEP = 0.01
 _SMALL_CHANGE = 0.01
