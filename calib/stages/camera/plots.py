@@ -360,12 +360,10 @@ def _projection_sigma(fit: Calibration, sigma: Covariance) -> Figure:
     values = projection_sigma_px(fit, sigma, pixels.reshape(-1, 2)).reshape(len(v), len(u))
     # What moves by more than the picture's size is not known at all.
     values[values > math.hypot(*size)] = np.inf
-    median = float(np.median(values[~np.isnan(values)])) if not np.isnan(values).all() else np.nan
     note = (
         f"With pictures taken again, the camera would put a point {number(sigma.distance_m, 'm')} away "
-        "elsewhere by this standard deviation, in the worst direction; its median is "
-        f"{number(median, 'px')}. The dashed line is the hull of the corners seen; beyond it the camera "
-        "extrapolates."
+        "elsewhere by this standard deviation, in the worst direction. The dashed line is the hull of the "
+        "corners seen; beyond it the camera extrapolates."
     )
     outline = Shape(hull(fit.observations.pixels[fit.observations.present]), edge="red", kind="dashed")
     panel = picture(size, (Field(u, v, values, "px", "standard deviation (px)"), outline))
