@@ -493,7 +493,7 @@ def _places(points: FloatArray) -> IntArray:
 
 
 def _like(basis: FloatArray, steps: FloatArray) -> FloatArray:
-    """The steps, or what they make together, that are nearest to a neighbour's basis (2, 2)."""
+    """Steps (2, 2), of either sign, nearest to a neighbour's basis, which stays where none is near."""
     near = np.concatenate([steps, -steps])
     chosen = near[np.argmin(np.linalg.norm(near[None] - basis[:, None], axis=2), axis=1)]
     off = np.linalg.norm(chosen - basis, axis=1) > _BESIDE * np.linalg.norm(basis, axis=1)

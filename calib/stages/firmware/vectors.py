@@ -93,8 +93,8 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     still = replace(still, gz_radps=0.0, mode=MODE_POSITION, reference=(1.1 * rest, 1.12 * rest))
     hold, nan = int(constants["CALIB_HOLD_TICKS"]), math.nan
     made: list[tuple[Inputs, int]] = []
-    for lost in (replace(still, marker_seen=False), replace(still, imu_read=False)):
-        made += [(still, 2), (lost, hold), (lost, 1), (still, 1)]
+    for silent in (replace(still, marker_seen=False), replace(still, imu_read=False)):
+        made += [(still, 2), (silent, hold), (silent, 1), (still, 1)]
     # A picture that is left out is none, and the pumps do not go on for it.
     boost = int(constants.get("CALIB_FUSED_BOOST_TICKS", 0))
     away = replace(still, u_px=_elsewhere(still.u_px))
@@ -174,8 +174,8 @@ def vectors(
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
     still = run[0]
     # What is known first is that the head is bent, and turns.
-    rest, both = constants["CALIB_IMU_GYRO_BIAS_RADPS"], [one.marker_seen and one.imu_read for one in run]
-    bent = max(range(ticks), key=lambda k: both[k] * abs(run[k].ay_mps2 * (run[k].gz_radps - rest)))
+    bias, both = constants["CALIB_IMU_GYRO_BIAS_RADPS"], [one.marker_seen and one.imu_read for one in run]
+    bent = max(range(ticks), key=lambda k: both[k] * abs(run[k].ay_mps2 * (run[k].gz_radps - bias)))
     run = [*run[bent:], *run[:bent]]
     given = [(one, 1) for one in run]
     if limits:
