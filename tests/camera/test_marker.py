@@ -122,6 +122,27 @@ def test_what_covers_the_marker_makes_it_lost_and_not_wrong() -> None:
     assert max(off) < 0.5
 
 
+@pytest.mark.parametrize("radius_px", [9.0, 20.0])
+def test_a_hose_before_a_part_makes_it_lost_or_unsure(radius_px: float) -> None:
+    """A grey bar crosses a disc that rests."""
+    zoom, centre, rng = 4, np.array([60.3, 59.8]), np.random.default_rng(0)
+    tracker, wrong = Tracker(parse_colour("orange")), []
+    for at in np.r_[-2.0, np.arange(-1.5, 1.6, 0.1)] * radius_px:
+        u, v = np.meshgrid(*2 * [(np.arange(120 * zoom) + 0.5) / zoom - 0.5])
+        fine = np.full((120 * zoom, 120 * zoom, 3), 0.1)
+        fine[np.hypot(u - centre[0], v - centre[1]) < radius_px] = 0.03, 0.22, 0.8
+        fine[np.abs(u - centre[0] - at) < 0.2 * radius_px] = 0.25
+        blurred = cv2.GaussianBlur(fine, (0, 0), 0.7 * zoom)
+        light = cv2.resize(blurred, (120, 120), interpolation=cv2.INTER_AREA)
+        frame = 255 * light ** (1 / 2.2) + 2.0 * rng.standard_normal(light.shape)
+        one = tracker.follow(np.clip(np.rint(frame), 0, 255).astype(np.uint8))
+        if one is not None:
+            off = one.centre_px - centre
+            assert np.abs(off).max() < max(5.0 * one.sigma_px, 0.25), at
+            wrong.append(np.hypot(*off) > 0.05 * radius_px)
+    assert len(wrong) >= 10 and sum(wrong) <= 2
+
+
 def test_sixty_frames_a_second_on_one_core() -> None:
     frames = [frame for _, frame in Scene(other="block").frames(20)]
     tracker, threads, spent = Tracker(parse_colour("orange")), cv2.getNumThreads(), []

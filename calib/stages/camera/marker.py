@@ -62,12 +62,20 @@ _ROUGH_SHARE = 0.06
 """Scatter of the edges over the radius above which a blob is no disc."""
 _LIGHT = (np.arange(256) / 255.0) ** 2.2
 """Light by grey level: mixtures are mixtures of light, and cameras store about its root."""
+_WAVES = np.exp(-1j * np.outer(_ANGLES, (3, 4)))
+"""The third and fourth wave around the outline: the first that an ellipse does not take up."""
+_BENT_SHARE, _BENT_PX = 0.025, 0.25
+"""Standard deviation of the centre, over the radius and in pixels, from which on what is seen is no disc,
+as with a hose before a fifth of it. Codecs mostly stay below."""
 _FLOOR_PX = 0.02
 """What uneven light and blur leave on rendered videos without noise."""
 _LEAST_COLOURED = 0.8
 """Share of the pixels inside that must have the marker's colour."""
 _AGAIN_FRAMES = 6
 """Frames without the marker after which the only disc of its colour and size is it, wherever that is."""
+_GROWTH, _GROWTH_PX, _GROWTH_LOST = 0.15, 1.0, 0.005
+"""By how much a radius may change from one frame to the next, and more for each frame without the marker:
+half a disc looks like one of three quarters of its radius."""
 _JUMP_RADII = 4.0
 """Radii within which the marker is taken for the same from one frame to the next, where there are two."""
 
@@ -206,6 +214,8 @@ def measured(bgr: AnyArray, middle_px: FloatArray, radius_px: float, colour: Col
         return None
     if radius < 1.5 or ellipse.scatter_px / radius > max(_ROUGH_SHARE, 0.4 / radius):
         return None
+    if ellipse.sigma_px > max(_BENT_SHARE * radius, _BENT_PX):
+        return None
     box = _box(bgr, ellipse, colour)
     return None if box is None else Disc(centre, ellipse.sigma_px, ellipse.axes_px, box)
 
@@ -285,7 +295,11 @@ def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
     # Neighbouring rays share pixels: about one independent edge for each pixel of the outline.
     outline = 2 * np.pi * float(np.sqrt(axes.prod()))
     independent = min(float(used.sum()), outline)
-    sigma = float(np.hypot(scatter * np.sqrt(2.0 / max(independent - 5.0, 1.0)), _FLOOR_PX))
+    alone = scatter * np.sqrt(2.0 / max(independent - 5.0, 1.0))
+    # What covers a part, and a codec, bends the outline over many rays. The first wave of that moves the
+    # centre, and is about as large as the next ones, which remain: of independent edges S is what `alone` is.
+    S = np.linalg.norm(np.where(used, left, 0.0) @ _WAVES) / used.sum()
+    sigma = float(np.hypot(max(alone, S), _FLOOR_PX))
     return _Ellipse(origin + scale * middle, axes, scatter, sigma, float(used.mean()))
 
 
@@ -404,7 +418,9 @@ class Tracker:
         def away(one: Disc) -> float:
             return float(np.hypot(*(one.centre_px - expected))) / before.radius_px
 
-        alike = [one for one in found if 0.6 < one.radius_px / before.radius_px < 1.6]
+        growth = _GROWTH + _GROWTH_PX / before.radius_px + _GROWTH_LOST * (self._since - 1)
+        most = min(growth, float(np.log(1.6)))
+        alike = [one for one in found if abs(np.log(one.radius_px / before.radius_px)) < most]
         ranked = sorted(alike, key=away)
         if self._since > _AGAIN_FRAMES and len(found) == len(alike) == 1 and not self.doubled:
             # Only one disc has ever been seen, wherever it went meanwhile.
