@@ -20,7 +20,7 @@ from calib.core.arrays import AnyArray, FloatArray
 from calib.core.errors import BadInputError, UsageError
 from calib.io.frames import Times
 from calib.io.logs import read_log
-from calib.stages.camera.marker import Disc, Tracker, colour_at, disc_centre, discs, parse_colour
+from calib.stages.camera.marker import Disc, Tracker, colour_at, disc_centre, discs, parse_colour, scatter_px
 from calib.stages.camera.model import project
 from calib.twin.pictures import CAMERA
 from calib.twin.scene import rotation
@@ -141,6 +141,16 @@ def test_a_hose_before_a_part_makes_it_lost_or_unsure(radius_px: float) -> None:
             assert np.abs(off).max() < max(5.0 * one.sigma_px, 0.25), at
             wrong.append(np.hypot(*off) > 0.05 * radius_px)
     assert len(wrong) >= 10 and sum(wrong) <= 2
+
+
+def test_the_scatter_of_a_path_is_that_of_its_noise_however_even_frames_are() -> None:
+    """Even frames, a file of variable rate, and even frames whose times of arrival are not."""
+    rng, even = np.random.default_rng(0), np.arange(400) / 60
+    uneven = np.cumsum(rng.choice([1 / 60, 1 / 30, 1 / 24], len(even)))
+    jitter = even + rng.uniform(0.0, 0.01, len(even))
+    for exposed, told in ((even, even), (uneven, uneven), (even, jitter)):
+        centres = Scene().centre_px(exposed) + 0.05 * rng.standard_normal((len(even), 2))
+        assert scatter_px(centres, told) == pytest.approx(0.05, rel=0.25)
 
 
 def test_sixty_frames_a_second_on_one_core() -> None:

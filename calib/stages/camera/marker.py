@@ -344,26 +344,38 @@ def disc_centre(
 # ----------------------------------------------------------------------
 # Following the marker from frame to frame.
 
-_STENCIL = np.array([-1.0, 3.0, -3.0, 1.0])
+_RUN = 4
+"""Frames of a third difference."""
 
 
-def scatter_px(centres_px: FloatArray) -> float:
+def scatter_px(centres_px: FloatArray, times_s: FloatArray) -> float:
     """Standard deviation of a coordinate by third differences of a track, which a smooth motion has none of.
 
     It sees what edges do not tell, as a codec that moves the whole marker. Motion that changes within four
-    frames counts as scatter.
+    frames counts as scatter. Frames may be as uneven as their times say, or even with times that are not.
 
     Parameters
     ----------
     centres_px : (n, 2) one for each frame, NaN where it was lost. NaN below 20 runs of four frames.
+    times_s : (n,) of the frames, increasing.
     """
-    if len(centres_px) < len(_STENCIL):
+    if len(centres_px) < _RUN:
         return float("nan")
-    third = sum(c * centres_px[k : len(centres_px) - 3 + k] for k, c in enumerate(_STENCIL))
-    known = np.asarray(third)[np.isfinite(third).all(axis=1)]
-    if len(known) < 20:
+    runs = np.lib.stride_tricks.sliding_window_view
+    places = runs(centres_px, _RUN, axis=0)
+    known = np.isfinite(places).all(axis=(1, 2))
+    if known.sum() < 20:
         return float("nan")
-    return float(1.4826 * np.median(np.abs(known)) / np.linalg.norm(_STENCIL))
+
+    def scatter(times: FloatArray) -> float:
+        t = runs(times, _RUN)[known]
+        apart = t[:, :, None] - t[:, None, :] + np.eye(_RUN)
+        weights = 1.0 / apart.prod(axis=2)
+        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+        third = (places[known] * weights[:, None]).sum(axis=2)
+        return float(1.4826 * np.median(np.abs(third)))
+
+    return min(scatter(times_s), scatter(np.arange(len(centres_px), dtype=np.float64)))
 
 
 @dataclass
@@ -454,7 +466,8 @@ def track_rows(
     if not seen:
         return []
     nowhere = np.full(2, np.nan)
-    scatter = scatter_px(np.array([nowhere if one is None else one.centre_px for one in found]))
+    centres = np.array([nowhere if one is None else one.centre_px for one in found])
+    scatter = scatter_px(centres, np.array(times_s[: len(found)]))
     usual = float(np.median([one.sigma_px for one in seen]))
     factor = max(1.0, scatter / usual) if np.isfinite(scatter) else 1.0
     rows = []
