@@ -153,6 +153,20 @@ def test_the_scatter_of_a_path_is_that_of_its_noise_however_even_frames_are() ->
         assert scatter_px(centres, told) == pytest.approx(0.05, rel=0.25)
 
 
+def test_a_marker_that_comes_back_is_followed_though_another_was_seen() -> None:
+    def frame(*places: tuple[float, float]) -> AnyArray:
+        image = np.full((240, 320, 3), 60, dtype=np.uint8)
+        for u, v in places:
+            cv2.circle(image, (round(16 * u), round(16 * v)), 16 * 9, (20, 120, 240), -1, cv2.LINE_AA, 4)
+        return image
+
+    tracker, other = Tracker(parse_colour("orange"), (200.0, 100.0)), (40.0, 40.0)
+    for k in range(12):
+        assert tracker.follow(frame((200.0 + 10 * k, 100.0), other)) is not None or k > 10
+    assert all(tracker.follow(frame()) is None for _ in range(60))
+    assert tracker.follow(frame((290.0, 120.0))) is not None
+
+
 def test_sixty_frames_a_second_on_one_core() -> None:
     frames = [frame for _, frame in Scene(other="block").frames(20)]
     tracker, threads, spent = Tracker(parse_colour("orange")), cv2.getNumThreads(), []

@@ -425,7 +425,8 @@ class Tracker:
             # Two of a kind cannot be told apart without a person's word.
             return found[0] if len(found) == 1 else None
         before = self._last
-        expected = before.centre_px + self._since * self._step_px
+        # A way that was not seen for long tells nothing.
+        expected = before.centre_px + min(self._since, _AGAIN_FRAMES) * self._step_px
 
         def away(one: Disc) -> float:
             return float(np.hypot(*(one.centre_px - expected))) / before.radius_px
