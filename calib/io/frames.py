@@ -172,6 +172,18 @@ class Times:
         return f"times from the file, {span}"
 
 
+def opened_video(source: int | str) -> cv2.VideoCapture | None:
+    """A video, a camera (its number) or a stream; None where it cannot be opened.
+
+    As with pictures, the sensor's own pixels count, however the camera was held.
+    """
+    # The binding has one form for a number and one for a name.
+    video = cv2.VideoCapture()
+    video.open(source)
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return video if video.isOpened() else None
+
+
 def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[Any, Any]]]:
     """Frames (H, W, 3) of a video (a path), or of a camera (its number, or a stream's address) until it ends.
 
@@ -180,13 +192,10 @@ def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[A
     name = shown(source) if isinstance(source, Path | str) else f"camera {source}"
     if isinstance(source, Path):
         check_readable(source)
-    video = cv2.VideoCapture()
-    video.open(str(source) if isinstance(source, Path) else source)
-    if not video.isOpened():
+    video = opened_video(str(source) if isinstance(source, Path) else source)
+    if video is None:
         what = "video that can be read" if isinstance(source, Path) else "camera that can be opened"
         raise BadInputError(f"{name}: is not a {what}")
-    # As with pictures, the sensor's own pixels count, however the camera was held.
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     times = Times(not isinstance(source, Path), float(video.get(cv2.CAP_PROP_FPS)))
 
     def frames() -> Iterator[np.ndarray[Any, Any]]:

@@ -14,6 +14,7 @@ import cv2
 from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
+from calib.io.frames import opened_video
 from calib.io.pictures import declared_pixels, holds_pictures, list_pictures
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
@@ -55,7 +56,7 @@ class Capture:
         self._file = isinstance(where, str) and "://" not in where
         self._newest: AnyArray | None = None
         self._ready, self._over = threading.Condition(), False
-        video = self._opened()
+        video = opened_video(self._where)
         if video is None:
             raise BadInputError(
                 f"{self._name}: cannot be opened, expected the number of a camera, a stream's address, a "
@@ -64,19 +65,13 @@ class Capture:
         self._thread = threading.Thread(target=self._run, args=(video,), daemon=True)
         self._thread.start()
 
-    def _opened(self) -> cv2.VideoCapture | None:
-        # The binding has one form for a number and one for a name.
-        video = cv2.VideoCapture()
-        video.open(self._where)
-        return video if video.isOpened() else None
-
     def _run(self, video: cv2.VideoCapture | None) -> None:
         period_s = 1.0 / max(video.get(cv2.CAP_PROP_FPS) or 30.0, 1.0) if video is not None else 0.0
         due = time.monotonic()
         while not self._over:
             if video is None:
                 time.sleep(_AGAIN_S)
-                video = None if self._over else self._opened()
+                video = None if self._over else opened_video(self._where)
                 continue
             there, frame = video.read()
             if not there or frame is None or frame.shape[0] * frame.shape[1] > MOST_PIXELS:

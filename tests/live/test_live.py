@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -233,6 +234,28 @@ def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
             assert "has ended" in heard(line, "camera")["fault"]
         wait(lambda: not live.state()["fitting"])
         assert len(live.album.names()) == 3
+
+
+def test_a_video_of_a_phone_held_upright_has_the_sensors_own_rows(tmp_path: Path) -> None:
+    """As for calib intrinsics and calib track: the container's turn is not followed."""
+    path = tmp_path / "phone.mp4"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 20, (64, 48))
+    for _ in range(20):
+        video.write(np.full((48, 64, 3), 90, dtype=np.uint8))
+    video.release()
+    # The matrix of the track's header, 44 bytes into it: a quarter turn.
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44
+    data[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 48 << 16, 0, 1 << 30)
+    path.write_bytes(data)
+    turned = cv2.VideoCapture(str(path))
+    assert turned.read()[1].shape == (64, 48, 3)
+    turned.release()
+    source = source_of(str(path), tmp_path / "images")
+    assert source is not None
+    frame = source.read()
+    source.close()
+    assert frame is not None and frame.shape == (48, 64, 3)
 
 
 # ----------------------------------------------------------------------
