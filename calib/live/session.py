@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import cv2
@@ -161,7 +161,9 @@ class Session:
         ghost = self.ghost()
         near, angle = self._near(grid, ghost), self._angle_deg(grid, ghost)
         matched = max(0.0, 1.0 - near / 0.1)
-        good = (near < _MATCH_SHARE and angle < _MATCH_DEG) or self._as_good(grid)
+        # Of a camera that nothing is known of the outline is a guess: a long lens cannot show it.
+        within = _MATCH_SHARE if self._plan is not None else 2 * _MATCH_SHARE
+        good = (near < within and angle < _MATCH_DEG) or self._as_good(grid)
         if not good:
             return Seen(grid, "move", self._hint(grid), matched=matched)
         if not hold:
@@ -272,12 +274,19 @@ class Session:
             return
         some = fit.calibration
         if np.all(np.isfinite(some.normal)) and some.observations.views >= _BEFORE:
-            self._plan = best_next_view(some, evidence(some).S.sum(axis=0))
+            self._plan = self._not_taken(best_next_view(some, evidence(some).S.sum(axis=0)))
         worst = projection_sigma_px(some, fit.covariance, image_outline(some.camera))
         sigma = fit.covariance.sigma().get("fx_px", np.inf)
         known = worst[~np.isnan(worst)]
         largest = float(known.max()) if len(known) else np.inf
         self.history.append(Progress(some.observations.views, float(sigma), largest))
+
+    def _not_taken(self, plan: Plan | None) -> Plan | None:
+        """The plan less poses that a picture has; one that the fit leaves out is not in the plan's views."""
+        if plan is None:
+            return None
+        new = [one for one in plan.candidates if self._alike(self._grid_at(plan, one)) is None]
+        return replace(plan, candidates=tuple(new)) if new else plan
 
     @property
     def enough(self) -> bool:
@@ -304,23 +313,30 @@ class Session:
             )
             size = "over half of the picture" if best.span_share > 0.5 else "at a third of the picture"
             says = f"Next: the board {best.where}, {lean}, {size}."
-            return _drawn(self._grid_at(best), best.R_CT, says, best.away)
+            return _drawn(self._grid_at(self._plan, best), best.R_CT, says, best.away)
         camera = self._nominal()
         away, (u, v), where = _START[len(self.views) % len(_START)]
         R = tilted(35.0, away)
         width, height = camera.image_size_px
         box = np.ptp(self._board().points_m(), axis=0)
         distance = camera.fx_px * float(np.hypot(*box)) / (0.5 * np.hypot(width, height))
-        ray = [(u - 0.5) * width / camera.fx_px, (v - 0.5) * height / camera.fx_px, 1.0]
+        ray = np.array([(u - 0.5) * width / camera.fx_px, (v - 0.5) * height / camera.fx_px, 1.0])
         says = f"Hold the board {where}, tilted, its {away} edge away from the camera."
-        grid = self._projected(camera, R, distance * np.array(ray), box)
+        # As near as the outer squares let it, in an upright picture too.
+        columns, rows = self.corners or _USUAL
+        whole = box * [(columns + 1) / (columns - 1), (rows + 1) / (rows - 1)]
+        for _ in range(20):
+            edge = self._projected(camera, R, distance * ray, whole)
+            if np.all((edge > 0) & (edge < [width - 1, height - 1])):
+                break
+            distance *= 1.1
+        grid = self._projected(camera, R, distance * ray, box)
         return _drawn(grid, R, says, away)
 
-    def _grid_at(self, pose: Candidate) -> FloatArray:
+    def _grid_at(self, plan: Plan, pose: Candidate) -> FloatArray:
         """Corners (rows, columns, 2) of the board in a planned pose."""
-        assert self._plan is not None
-        box = np.ptp(self._plan.target_m, axis=0)[:2]
-        return self._projected(self._plan.calibration.camera, pose.R_CT, pose.t_m, box)
+        box = np.ptp(plan.target_m, axis=0)[:2]
+        return self._projected(plan.calibration.camera, pose.R_CT, pose.t_m, box)
 
     def _projected(self, camera: Camera, R: FloatArray, t_m: FloatArray, box_m: FloatArray) -> FloatArray:
         columns, rows = self.corners or _USUAL

@@ -137,6 +137,34 @@ def test_what_is_told_and_not_taken() -> None:
     assert other.code == "size" and "160x120" in other.says and "320x240" in other.says
 
 
+@pytest.mark.parametrize("size_px", [(640, 480), (480, 640), (720, 1280)])
+@pytest.mark.parametrize("corners", [(8, 5), (5, 8), (4, 3)])
+def test_the_first_outlines_are_in_the_picture(size_px: tuple[int, int], corners: tuple[int, int]) -> None:
+    """Those of a camera that is mounted upright too."""
+    live = Session(corners=corners, size_px=size_px)
+    for k in range(4):
+        box = live.ghost().box_px
+        assert box.min() > 0 and np.all(box < size_px)
+        live.views[f"{k}"] = View("", np.zeros((0, 3)), np.zeros((0, 2)))
+
+
+def test_a_pose_whose_picture_the_fit_leaves_out_is_not_asked_for_again() -> None:
+    rng, live = np.random.default_rng(0), session()
+    live.corners = (BOARD.columns, BOARD.rows)
+    for k, pose in zip(range(4), random_poses(rng), strict=False):
+        pixels = corner_pixels(CAMERA, PrintedBoard(BOARD), pose)
+        live.views[f"{k}"] = View(f"{k}", BOARD.points_m(), pixels + 0.1 * rng.standard_normal(pixels.shape))
+    fit = calibrate_camera(list(live.views.values()), CAMERA.image_size_px)
+    live.fitted(fit)
+    for k in range(4, 7):
+        grid = np.stack(live.ghost().lines_px[: BOARD.rows])
+        live.views[f"{k}"] = View(f"{k}", BOARD.points_m(), grid.reshape(-1, 2))
+        # As where its corners scatter too much.
+        live.fitted(fit)
+        other = np.stack(live.ghost().lines_px[: BOARD.rows])
+        assert np.sqrt(((other - grid) ** 2).sum(axis=-1).mean()) > 0.02 * CAMERA.image_size_px[0]
+
+
 def test_the_blur_of_edges_is_measured() -> None:
     pose = pose_facing(CAMERA, PrintedBoard(BOARD), (160.0, 120.0), 0.35, 0.3, 0.5)
     grid = corner_pixels(CAMERA, PrintedBoard(BOARD), pose).reshape(BOARD.rows, BOARD.columns, 2)
