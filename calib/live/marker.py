@@ -52,6 +52,11 @@ class Marker:
     _discs: list[Disc | None] = field(default_factory=list)
     _plot: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=600))
 
+    @property
+    def recording(self) -> bool:
+        """Whether a recording is under way."""
+        return self._stream is not None
+
     def follow(self, frame: AnyArray, t_s: float) -> dict[str, Any]:
         """What a page is told of a frame (H, W, 3) that was taken at a time; a row where that is recorded."""
         if frame.ndim == 2:

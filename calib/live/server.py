@@ -56,6 +56,8 @@ _PREVIEW_PX = 800
 _SWITCH_S = 0.0005
 STEPS = ("camera", "plane", "marker", "board")
 _PLOTS_S = 0.3
+_CLOCK_S = 5.0
+"""By how much the times of a page's camera may be off this computer's before they are another camera's."""
 _SHOT_S = 5.0
 """How long a page may take to send the whole picture that it was asked for."""
 
@@ -70,6 +72,8 @@ class _Tab:
     shot_until: float = 0.0
     by_hand: bool = False
     taken_s: float | None = None
+    clock_s: float | None = None
+    """What its camera's times lack to those of this computer."""
 
     async def tell(self, message: dict[str, Any] | bytes) -> None:
         """Send words or a frame; a page that has gone is no reason to fail."""
@@ -103,6 +107,7 @@ class Live:
         self._lock = threading.Lock()
         self._tabs: list[_Tab] = []
         self._camera: _Tab | None = None
+        self._lent: _Tab | None = None
         self._looking = ThreadPoolExecutor(1, "look")
         self._fitting = ThreadPoolExecutor(1, "fit")
         self._wanted, self._fits = 0, 0
@@ -303,8 +308,7 @@ class Live:
             tab.size_px = _size_px(asked.get("size"))
             await self._lend(tab)
         elif what == "at":
-            at_s = asked.get("t_s")
-            tab.taken_s = float(at_s) if isinstance(at_s, int | float) and 0 <= at_s < 1e9 else None
+            await self._at(tab, asked.get("t_s"))
         elif what == "take":
             if self.source is not None:
                 self._by_hand = True
@@ -412,8 +416,33 @@ class Live:
     async def _lend(self, tab: _Tab) -> None:
         """Let this page's camera be the one that counts."""
         before, self._camera = self._camera, tab
+        if self._lent not in (None, tab):
+            await self._other_camera()
+        self._lent = tab
         if before is not None and before is not tab:
             await before.tell({"type": "lent"})
+
+    async def _at(self, tab: _Tab, at_s: Any) -> None:
+        """Take the time of a page's next frame, on this computer's clock from its first one on."""
+        before, now, tab.taken_s = tab.taken_s, time.monotonic(), None
+        if not (isinstance(at_s, int | float) and 0 <= at_s < 1e9):
+            return
+        if tab.clock_s is not None:
+            taken_s = at_s + tab.clock_s
+            if abs(now - taken_s) > _CLOCK_S or (before is not None and taken_s < before):
+                await self._other_camera()
+                tab.clock_s = None
+        if tab.clock_s is None:
+            tab.clock_s = now - at_s
+        tab.taken_s = at_s + tab.clock_s
+
+    async def _other_camera(self) -> None:
+        """End a recording whose camera is another one from now on: a log has one clock."""
+        if self.marker.recording:
+            await self._in(self._looking, self._held, self.marker.stop)
+            says = "The camera is another one now: the recording has ended. Begin a new one."
+            await self.tell_all({"type": "fault", "says": says})
+            await self.tell_all(await asyncio.to_thread(self.state))
 
     async def _shoot(self, tab: _Tab, by_hand: bool) -> None:
         tab.shot_until, tab.by_hand = time.monotonic() + _SHOT_S, by_hand

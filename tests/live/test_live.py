@@ -550,13 +550,23 @@ def test_a_marker_is_recorded_while_one_looks_at_it(tmp_path: Path) -> None:
         wait(lambda: "29 of 29 frames" in live.marker.last)
         track = read_log(log)
         assert np.allclose(track.t_s, np.arange(29) / 30, atol=1e-6)
+        # A camera that was lost and comes back begins at zero again: a log has one clock.
+        line.send('{"do": "record"}')
+        for at_s in (6.0, 6.1, 0.1, 0.2):
+            line.send(json.dumps({"do": "at", "t_s": at_s}))
+            line.send(jpeg(frame))
+            if at_s == 0.1:
+                assert "camera is another one" in heard(line, "fault")["says"]
+            heard(line, "seen")
+        assert not live.marker.recording and "2 of 2 frames" in live.marker.last
+        assert len(read_log(log.with_name("track2.csv")).t_s) == 2
         # One that sees nothing leaves nothing.
         line.send('{"do": "record"}')
         line.send('{"do": "stop"}')
         wait(lambda: "nothing was recorded" in live.marker.last)
         line.send('{"do": "colour", "name": "no colour"}')
         assert "is no colour" in heard(line, "fault")["says"]
-    assert [path.name for path in log.parent.iterdir()] == ["track1.csv"]
+    assert sorted(path.name for path in log.parent.iterdir()) == ["track1.csv", "track2.csv"]
 
 
 def test_a_board_is_recorded_from_the_page(tmp_path: Path) -> None:
