@@ -209,7 +209,7 @@ class Live:
             await self.tell_all({"type": "fault", "says": str(error)})
             return
         if isinstance(name, Seen):
-            await self.tell_all({"type": "seen", "code": name.code, "says": name.says, "corners": None})
+            await self.tell_all({**_seen(Seen(None, name.code, name.says)), "answer": True})
             if name.code == "taken":
                 await self.tell_all({"type": "taken", "name": ""})
                 await self.tell_all(self.state())

@@ -639,6 +639,14 @@ def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
             wait(lambda: live.state()["verdict"] == "ok" and not live.state()["fitting"], 60.0)
             browser.key("a", 65, "a")
             wait(lambda: not live.auto and not live.state()["fitting"])
+            # An answer stays while frames go on telling what they show.
+            browser.run("send({do: 'colour', name: 'gold-ish'})")
+            wait(lambda: "no colour" in browser.run("document.getElementById('says').textContent"))
+            time.sleep(2.0)
+            assert "no colour" in browser.run("document.getElementById('says').textContent")
+            browser.run("video.pause()")
+            wait(lambda: "no new pictures" in browser.run("document.getElementById('says').textContent"))
+            browser.run("video.play()")
             # Until then another picture may be taken.
             count = len(live.state()["pictures"])
             assert count >= 4
