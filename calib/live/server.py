@@ -178,7 +178,8 @@ class Live:
         with self._lock:
             if self.step == "plane":
                 return self.flat.take(gray, png)
-            if self.step != "camera":
+            # A picture that was asked for may still be under way when taking by itself is switched off.
+            if self.step != "camera" or not (by_hand or self.auto):
                 return Seen(None, "hold", "")
             if len(self.session.views) >= MOST_PICTURES:
                 raise BadInputError(f"there are {MOST_PICTURES} pictures already, the most of one session")
