@@ -405,10 +405,13 @@ def read_log(
     if not blocks:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
     first = blocks[0]
+    # A column at a time, so that nothing but one of them is there twice.
+    parts = [dict(block.columns) for block in blocks]
+    blocks = [replace(block, columns={}) for block in blocks]
     log = replace(
         first,
         t_s=np.concatenate([block.t_s for block in blocks]),
-        columns={name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
+        columns={name: np.concatenate([part.pop(name) for part in parts]) for name in first.columns},
         lines=np.concatenate([block.lines for block in blocks]),
         passed=sum((block.passed for block in blocks), ALL_TAKEN),
     )
@@ -763,8 +766,9 @@ def _unmoved(log: Log) -> Finding | None:
         upright &= across > _UPRIGHT * (across + az * az)
     turned = np.cumsum(rate * np.diff(t_s, prepend=t_s[0]))
     edges = np.flatnonzero(np.diff(gz, prepend=np.nan, append=np.nan) != 0.0)
-    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        lasting = b - a >= _FEWEST and t_s[b - 1] - t_s[a] >= _STUCK_S and upright[a:b].mean() > 0.9
+    long = np.flatnonzero(np.diff(edges) >= _FEWEST)
+    for a, b in zip(edges[long].tolist(), edges[long + 1].tolist(), strict=True):
+        lasting = t_s[b - 1] - t_s[a] >= _STUCK_S and upright[a:b].mean() > 0.9
         if lasting and float(felt[a:b].std()) > _SHAKEN_RAD:
             return Finding(
                 "inconsistent",

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
 
 from calib.core.arrays import BoolArray, FloatArray, integral
 
@@ -171,6 +170,9 @@ def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, most: float) -> 
 
     Where too little is shared to say anything, all is left. `most` as in `shares`.
     """
+    # Most users of this module never come here; the package takes 24 MB and a tenth of a second.
+    from scipy.signal import correlate
+
     seen = np.where(known, seen - seen[known].mean(), 0.0)
     there, rows = np.ones(len(felt)), known.astype(np.float64)
     cross, own = correlate(felt, seen), correlate(felt**2, rows)

@@ -208,23 +208,27 @@ class Problem:
 
 @dataclass(frozen=True)
 class Arrow:
-    """Factors of the normal equations."""
+    """Normal equations [A B; B' C] of all coefficients and s: factors of each stretch's A, its B, and of S.
+
+    S = C - B' A^-1 B. An hour at 100 Hz has 35 MB of A and 40 MB of B.
+    """
 
     factors: list[FloatArray]
-    X: list[FloatArray]
+    B: list[FloatArray]
     S: tuple[FloatArray, bool]
+
+    def own(self, i: int, right: FloatArray) -> FloatArray:
+        """A^-1 times a right-hand side (2 count,) or (2 count, k) of stretch i."""
+        return np.asarray(cho_solve_banded((self.factors[i], True), right, check_finite=False))
 
     def solve(self, to_c: list[FloatArray], to_s: FloatArray) -> tuple[list[FloatArray], FloatArray]:
         """Steps of all coefficients and of s for a right-hand side."""
-        right = to_s.copy()
-        for X, g in zip(self.X, to_c, strict=True):
-            right -= X.T @ g
+        steps, right = [self.own(i, g) for i, g in enumerate(to_c)], to_s.copy()
+        for B, step in zip(self.B, steps, strict=True):
+            right -= B.T @ step
         ds = np.asarray(cho_solve(self.S, right))
-        steps = []
-        for factor, X, g in zip(self.factors, self.X, to_c, strict=True):
-            step = cho_solve_banded((factor, True), g, check_finite=False)
-            step -= X @ ds
-            steps.append(step)
+        for i, (B, step) in enumerate(zip(self.B, steps, strict=True)):
+            step -= self.own(i, B @ ds)
         return steps, ds
 
     def size(self, ds: FloatArray) -> float:
@@ -299,14 +303,11 @@ def _loss(problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise) -
 def _normal(
     problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise
 ) -> tuple[Arrow, list[FloatArray], FloatArray, list[FloatArray]]:
-    """Factors, right-hand sides, and the probability of each picture to show the marker.
-
-    A turns into its factor where it is, and B goes once X is there: an hour at 100 Hz has 35 MB of each.
-    """
+    """Factors, right-hand sides, and the probability of each picture to show the marker."""
     C, taken = np.diag(1.0 / problem.sigma**2), np.zeros((len(s), len(s)))
     to_s = (problem.mean - s) / problem.sigma**2
     factors: list[FloatArray] = []
-    Xs: list[FloatArray] = []
+    Bs: list[FloatArray] = []
     to_cs: list[FloatArray] = []
     goods: list[FloatArray] = []
     for stretch, c in zip(problem.stretches, cs, strict=True):
@@ -327,14 +328,15 @@ def _normal(
             gathered(rows.span, rows.basis, rows.by, pull[part], to_c, to_s)
         A[0] += np.tile(1.0 / _ANCHOR**2, len(c))
         to_c += ((stretch.start - c) / _ANCHOR**2).ravel()
+        # A turns into its factor where it is, and A^-1 B is never there as a whole.
         factors.append(cholesky_banded(A, lower=True, overwrite_ab=True, check_finite=False))
-        Xs.append(np.asarray(cho_solve_banded((factors[-1], True), B, check_finite=False)))
-        taken += B.T @ Xs[-1]
+        for k in range(len(s)):
+            taken[:, k] += B.T @ cho_solve_banded((factors[-1], True), B[:, k], check_finite=False)
+        Bs.append(B)
         to_cs.append(to_c)
         goods.append(np.concatenate(good))
-        del B
     S = C - taken
-    return Arrow(factors, Xs, cho_factor(0.5 * (S + S.T))), to_cs, to_s, goods
+    return Arrow(factors, Bs, cho_factor(0.5 * (S + S.T))), to_cs, to_s, goods
 
 
 # ----------------------------------------------------------------------
@@ -790,28 +792,29 @@ def _imu_noise(
 ) -> FloatArray:
     """Deviations (3,) of the IMU's readings by their residuals and degrees of freedom."""
     rng, both = np.random.default_rng(0), np.array([-1, 1], dtype=np.int8)
-    signs = [
-        [rng.choice(both, len(stretch.imu_s)) for stretch in problem.stretches] for _ in range(3 * _PROBES)
-    ]
-    to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in signs], np.zeros((len(signs), len(s)))
     squares, count, taken = np.zeros(3), np.zeros(3), np.zeros(3)
-    for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
-        done = 0
-        for off, rows in _readings(stretch, c, s):
-            _, pull, weight = imu_terms(off, noise.imu)
-            # Beyond `HUBER` deviations a reading counts as one there: a few wild ones are no noise.
-            squares += ((pull * noise.imu) ** 2).sum(axis=0)
-            count += (weight > 0.0).sum(axis=0)
-            root = np.sqrt(weight)
-            for probe in range(len(signs)):
-                channel, signed = probe // _PROBES, np.zeros_like(root)
-                signed[:, channel] = root[:, channel] * signs[probe][i][done : done + len(off)]
-                gathered(rows.span, rows.basis, rows.by, signed, to_cs[probe][i], to_s[probe])
-            done += len(off)
-    for probe in range(len(signs)):
-        dcs, ds = arrow.solve(to_cs[probe], to_s[probe])
-        own = sum(float(a @ b) for a, b in zip(dcs, to_cs[probe], strict=True))
-        taken[probe // _PROBES] += own + float(ds @ to_s[probe])
+    # One channel at a time: each probe takes the memory of all coefficients.
+    for channel in range(3):
+        signs = [
+            [rng.choice(both, len(stretch.imu_s)) for stretch in problem.stretches] for _ in range(_PROBES)
+        ]
+        to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in signs], np.zeros((_PROBES, len(s)))
+        for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
+            done = 0
+            for off, rows in _readings(stretch, c, s):
+                _, pull, weight = imu_terms(off, noise.imu)
+                # Beyond `HUBER` deviations a reading counts as one there: a few wild ones are no noise.
+                squares[channel] += ((pull[:, channel] * noise.imu[channel]) ** 2).sum()
+                count[channel] += (weight[:, channel] > 0.0).sum()
+                root = np.where(np.arange(3) == channel, np.sqrt(weight), 0.0)
+                for probe in range(_PROBES):
+                    signed = root * signs[probe][i][done : done + len(off), None]
+                    gathered(rows.span, rows.basis, rows.by, signed, to_cs[probe][i], to_s[probe])
+                done += len(off)
+        for to_c, to in zip(to_cs, to_s, strict=True):
+            dcs, ds = arrow.solve(to_c, to)
+            own = sum(float(a @ b) for a, b in zip(dcs, to_c, strict=True))
+            taken[channel] += own + float(ds @ to)
     left = np.maximum(count - taken / _PROBES, 1.0)
     found = noise.imu * np.sqrt(squares / left)
     # Without readings of an axis its deviation plays no part.
@@ -877,7 +880,7 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
     for off, rows in _readings(stretch, c, fit.sensor):
         _, _, weight = imu_terms(off, fit.noise.imu)
         gathered(rows.span, rows.basis, rows.by, -weight * change, to_c, to_s)
-    return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.X[i].T @ to_c))
+    return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.B[i].T @ fit.arrow.own(i, to_c)))
 
 
 # ----------------------------------------------------------------------
