@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +51,7 @@ class Marker:
     _stream: BinaryIO | None = None
     _times: Times = field(default_factory=lambda: Times(arrival=True, rate_hz=0.0))
     _discs: list[Disc | None] = field(default_factory=list)
-    _plot: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=600))
+    _plot: deque[tuple[float, float | None, float | None]] = field(default_factory=lambda: deque(maxlen=600))
 
     @property
     def recording(self) -> bool:
@@ -68,15 +69,16 @@ class Marker:
         if self._stream is not None:
             self._record(one, t_s)
         size = [frame.shape[1], frame.shape[0]]
+        while self._plot and self._plot[0][0] < t_s - _PLOTTED_S:
+            self._plot.popleft()
         if one is None:
+            self._plot.append((t_s, None, None))
             says = "The marker is not seen: click on it."
             if self.tracker.doubled:
                 says = "Several discs have its colour: click on the marker."
             return {"code": "no board", "says": says, "size": size}
         u, v = one.centre_px.tolist()
-        self._plot.append((t_s, u, v))
-        while self._plot[0][0] < t_s - _PLOTTED_S:
-            self._plot.popleft()
+        self._plot.append((t_s, round(u, 2), round(v, 2)))
         marker = {"u": round(u, 2), "v": round(v, 2), "radius": round(one.radius_px, 2)}
         says = f"Recording: {len(self._discs)} frames." if self._stream else "The marker is seen."
         return {"code": "hold", "says": says, "size": size, "marker": marker | {"sigma": one.sigma_px}}
@@ -118,24 +120,38 @@ class Marker:
             return
         stamps.append(t_s)
         self._discs.append(one)
-        assert self._stream is not None
-        self._stream.write(track_text(track_rows([t_s - stamps[0]], [one])).encode())
-        self._stream.flush()
+        assert self._stream is not None and self.path is not None
+        try:
+            self._stream.write(track_text(track_rows([t_s - stamps[0]], [one])).encode())
+            self._stream.flush()
+        except OSError as error:
+            self._close()
+            self.last = f"ended: {shown(self.path)} cannot be written: {error.strerror or error}"
         if len(stamps) >= _MOST_FRAMES:
             self.stop()
+
+    def _close(self) -> None:
+        if self._stream is not None:
+            # What cannot be written has been told, or is written once more.
+            with contextlib.suppress(OSError):
+                self._stream.close()
+        self._stream = None
 
     def stop(self) -> None:
         """End a recording, and say what it is worth; without effect where there is none."""
         if self._stream is None or self.path is None:
             return
-        self._stream.close()
-        self._stream = None
+        self._close()
         rows = track_rows(self._times.settled_s(), self._discs) if self._discs else []
         if not rows:
             self.path.unlink(missing_ok=True)
             self.last = "nothing was recorded: the marker was not seen"
             return
-        write_atomically(self.path, _HEAD + track_text(rows), TRACK)
+        try:
+            write_atomically(self.path, _HEAD + track_text(rows), TRACK)
+        except BadInputError as error:
+            self.last = f"{error}; it has the rows that came before"
+            return
         seen = f"marker in {len(rows)} of {len(self._discs)} frames, written to {shown(self.path)}"
         sigma = float(np.median([row[3] for row in rows]))
         self.last = f"{seen}; sigma of the centre {sigma:.2f} px; {self._times.words()}"
@@ -147,6 +163,6 @@ class Marker:
             "hue_deg": round(self.colour.hue_deg),
             "recording": None if self._stream is None or self.path is None else self.path.name,
             "last": self.last,
-            "plot": [[round(t - begin, 3), round(u, 2), round(v, 2)] for t, u, v in self._plot],
+            "plot": [[round(t - begin, 3), u, v] for t, u, v in self._plot],
             "logs": [path.name for path in sorted(self.album.logs.glob("*.csv"))][:100],
         }

@@ -97,10 +97,11 @@ class Flat:
             raise BadInputError(
                 "first take a picture of the board in the plane, and click on its corner (0, 0)"
             )
-        x, y, angle = (_number(asked.get(key), key) for key in ("x_mm", "y_mm", "angle_deg"))
+        x, y = (_number(asked.get(f"{axis}_mm"), f"{axis} of corner (0, 0), mm") for axis in "xy")
+        angle = _number(asked.get("angle_deg"), "the angle of the columns, degrees")
         square = self.session.square_m
         if square is None:
-            square = 1e-3 * _number(asked.get("square_mm"), "the side of a square")
+            square = 1e-3 * _number(asked.get("square_mm"), "the side of a square, mm")
         if not 1e-4 <= square <= 1.0:
             raise BadInputError(f"the side of a square is {1e3 * square:g} mm, expected 0.1 mm to 1 m")
         self.session.square_m = square
@@ -134,7 +135,8 @@ class Flat:
 
 def _number(value: Any, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e3 * _MOST_M:
-        raise BadInputError(f"{name} is no number that can be, expected one")
+        found = "" if value is None else f" is {str(value)[:40]}"
+        raise BadInputError(f"{name}{found}: expected a number up to {1e3 * _MOST_M:g}")
     return float(value)
 
 

@@ -324,7 +324,10 @@ class Live:
             await self._done()
         elif what in self._steps:
             try:
-                await self._in(self._fitting if what == "place" else self._looking, self._steps[what], asked)
+                pool = self._fitting if what == "place" else self._looking
+                says = await self._in(pool, self._steps[what], asked)
+                if says is not None:
+                    await self.tell_all({**_seen(Seen(None, "hold", says)), "answer": True})
             except CalibError as error:
                 await self.tell_all({"type": "fault", "says": _sentence(error)})
             await self.tell_all(await asyncio.to_thread(self.state))
@@ -335,7 +338,7 @@ class Live:
     # Plane, marker and board: what a page asks of them.
 
     @property
-    def _steps(self) -> dict[str, Callable[[dict[str, Any]], None]]:
+    def _steps(self) -> dict[str, Callable[[dict[str, Any]], str | None]]:
         return {
             "step": self._go,
             "point": self._point,
@@ -375,8 +378,8 @@ class Live:
         elif self.step == "marker":
             self._held(self.marker.click, (at[0], at[1]))
 
-    def _place(self, asked: dict[str, Any]) -> None:
-        """Save the board in the plane where a person says it lies, and calibrate the plane."""
+    def _place(self, asked: dict[str, Any]) -> str:
+        """Save the board in the plane where a person says it lies, calibrate the plane, and say so."""
         with self._lock:
             board, png = self.flat.place(asked), self.flat.png
         assert png is not None
@@ -385,6 +388,8 @@ class Live:
         with self._lock:
             self.rig = rig
             self.flat.drop()
+        assert rig.plane is not None
+        return f"The plane is saved. Its verdict: {rig.plane.verdict.word}."
 
     def _record(self, asked: dict[str, Any]) -> None:
         if self.step == "marker":

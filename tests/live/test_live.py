@@ -35,6 +35,7 @@ from calib.core.geometry import box_grid
 from calib.io.logs import read_log
 from calib.io.serial import Frame, Inputs, Outputs
 from calib.live.album import Album
+from calib.live.marker import Marker
 from calib.live.server import MOST_BYTES, Live
 from calib.live.session import ENOUGH, Seen, Session, edge_blur_px
 from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
@@ -484,7 +485,7 @@ def test_the_plane_is_what_extrinsics_makes_of_the_corner_that_was_clicked(
             wait(lambda: live.flat.chosen == corner)
             for wrong in ({}, {"x_mm": "1"}, {"x_mm": float("nan"), "y_mm": 0, "angle_deg": 0}):
                 line.send(json.dumps({"do": "place", **wrong}))
-                assert "is no number" in heard(line, "fault")["says"]
+                assert "expected a number up to 10000" in heard(line, "fault")["says"]
             line.send(json.dumps({"do": "place", **place}))
             wait(lambda: live.flat.png is None)
 
@@ -567,6 +568,21 @@ def test_a_marker_is_recorded_while_one_looks_at_it(tmp_path: Path) -> None:
         line.send('{"do": "colour", "name": "no colour"}')
         assert "is no colour" in heard(line, "fault")["says"]
     assert sorted(path.name for path in log.parent.iterdir()) == ["track1.csv", "track2.csv"]
+
+
+def test_a_full_disk_ends_a_recording_and_not_the_page(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full")
+    marker = Marker(Album(tmp_path))
+    marker.start()
+    (frame,) = (frame for _, frame in Scene(other="none").frames(1))
+    assert marker.follow(frame, 0.0)["says"] == "Recording: 1 frames."
+    assert marker._stream is not None
+    marker._stream.close()
+    marker._stream = Path("/dev/full").open("wb")  # noqa: SIM115  the marker closes it
+    assert "marker" in marker.follow(frame, 0.1) and not marker.recording
+    assert "track1.csv cannot be written: No space left" in marker.last
+    assert len((tmp_path / "logs" / "track1.csv").read_text().splitlines()) == 2
 
 
 def test_a_board_is_recorded_from_the_page(tmp_path: Path) -> None:
@@ -727,6 +743,12 @@ def test_what_the_command_refuses(
     code, said = ends("x.mp4")
     assert code == 3 and "x.mp4: cannot be opened" in said
     assert ends("--square", "20")[0] == 2
+    monkeypatch.setattr(Live, "serve", lambda *_: None)
+    code, said = ends()
+    assert code == 3 and "no picture was taken" in said
+    monkeypatch.setattr(Live, "serve", lambda live, _: live.album.new_log("track").write_text("t_s\n"))
+    code, said = ends()
+    assert code == 0 and "recordings are in live/logs" in said
     monkeypatch.setitem(sys.modules, "starlette.applications", None)
     monkeypatch.delitem(sys.modules, "calib.live.server", raising=False)
     code, said = ends()
