@@ -86,6 +86,8 @@ def live(
         raise UsageError(f"--port needs pyserial: {pip_install('serial')}")
     at_work = Live(session, album, frames, port)
 
+    before = set(album.logs.glob("*.csv"))
+
     def ready(address: str) -> None:
         narrate(f"open {address}; Done on the page, or Ctrl-C, ends it")
         if browser:
@@ -98,6 +100,11 @@ def live(
     except KeyboardInterrupt:
         Interrupts.settle()
         narrate("ended; what was taken is saved")
+    if not album.names() and set(album.logs.glob("*.csv")) - before:
+        narrate(f"recordings are in {shown(album.logs)}; no picture was taken, so no camera is calibrated")
+        if as_json:
+            document("live", {"camera": None, "pictures": []})
+        return
     if not album.names():
         raise BadInputError(
             f"{shown(album.images)}: no picture was taken; hold the board as the page outlines it, or press "
