@@ -218,7 +218,7 @@ def page_text(rig: Path) -> str:
     hidden = rig.parent / HIDDEN
     told = read_summary(hidden / "run.json") or _summary_of(whole)
     budget = _Budget(MOST_BYTES - _ROOM_BYTES)
-    views = _views(hidden, _Budget(_VIEWS_BYTES))
+    views, unseen = _views(hidden, _Budget(_VIEWS_BYTES))
     budget.left -= sum(len(view["image"]) for view in views)
     stages = _stages(told, whole, hidden, budget)
     return render(
@@ -230,6 +230,7 @@ def page_text(rig: Path) -> str:
         told=told,
         stages=stages,
         views=views,
+        unseen=unseen,
         views_json=_as_script(views),
         constants=[
             {
@@ -278,8 +279,8 @@ def _summary_of(rig: Rig) -> dict[str, Any]:
     return {**told, "jobs": jobs, "alone": True}
 
 
-def _views(hidden: Path, budget: _Budget) -> list[dict[str, Any]]:
-    """Each view with its picture and its residuals, the worst first where not all fit."""
+def _views(hidden: Path, budget: _Budget) -> tuple[list[dict[str, Any]], int]:
+    """Each view with its picture and its residuals, the worst first where not all fit; how many do not."""
     result = load(hidden / "stages" / "intrinsics")
     seen = [] if result is None else result.document().get("per_view") or []
     out = []
@@ -300,7 +301,7 @@ def _views(hidden: Path, budget: _Budget) -> list[dict[str, Any]]:
             }
         )
     order = {str(view.get("view")): k for k, view in enumerate(seen)}
-    return sorted(out, key=lambda one: order[one["name"]])
+    return sorted(out, key=lambda one: order[one["name"]]), len(seen) - len(out)
 
 
 def _stages(told: Mapping[str, Any], rig: Rig, hidden: Path, budget: _Budget) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ from calib.runner.cache import Result
 from calib.runner.decision import decide
 from calib.runner.fleet import FleetSummary, RigSpec, summarise, table_of
 from calib.runner.outcomes import Outcome
+from calib.show import page
 from calib.show.charts import library
 from calib.show.fleet import PAGE, fleet_page_text, write_fleet_page
 from calib.show.page import (
@@ -95,6 +96,13 @@ def test_nothing_leads_out_of_the_page_and_nothing_breaks_in(rig: Path) -> None:
     assert "owned'</script>" not in text
     assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", text.replace(library(), ""))
     assert text.count("49.png") == 0
+
+
+def test_views_that_have_no_room_are_counted(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no room" not in page_text(rig)
+    largest = max(len(one["image"]) for one in page._views(rig.parent / ".calib", page._Budget(10**6))[0])
+    monkeypatch.setattr(page, "_VIEWS_BYTES", largest)
+    assert "2 more have no room on this page" in page_text(rig)
 
 
 def test_same_run_same_bytes_and_no_place(rig: Path) -> None:

@@ -527,7 +527,7 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
             f"The worst percent of the points holds {100 * heavy:.0f} % of the squared error "
             "(five is normal)."
         )
-        yield Finding("remark", text, "Use a robust loss, or look at these corners.")
+        yield Finding("remark", text, "Look at the corners with the largest errors, or use a robust loss.")
 
 
 def far_points(distance: FloatArray, there: BoolArray, typical: float) -> BoolArray:
@@ -555,7 +555,7 @@ def _of_points(distance: FloatArray, fine: BoolArray, names: tuple[str, ...]) ->
             f"{100 * Limits.points_poor:.0f} is good)."
         )
         many = share > Limits.points_poor
-        advice = "Use a robust loss, or look at these corners." if many else ""
+        advice = "Look at the corners with the largest errors, or use a robust loss." if many else ""
         yield Finding("poor" if many else "remark", text, advice)
 
 
