@@ -45,6 +45,8 @@ MOST_POINTS = 400
 _MOST_DOTS = 900
 _MOST_CELLS = 1500
 """Of a map."""
+_FEW = 7.0
+"""Span of whole numbers below which each has its tick."""
 _PX_PER_IN = 80.0
 _DASHES = {"line": "solid", "dashed": "dash", "dotted": "dot"}
 _SYMBOLS = {
@@ -198,7 +200,8 @@ class _Panel:
         elif name in plot.log:
             axis["type"] = "log"
         if name in plot.whole:
-            axis |= {"tickformat": "d"}
+            # Between few values there would be ticks at halves, under the numbers of their neighbours.
+            axis |= {"tickformat": "d"} | ({"dtick": 1} if self._span(name) < _FEW else {})
         if limits is not None and np.isfinite(limits).all():
             ends = self._at(name, np.array(limits))
             axis["range"] = _shown(np.log10(ends) if axis.get("type") == "log" else ends)
@@ -211,6 +214,18 @@ class _Panel:
         elif name == "y" and plot.down:
             axis |= {"range": axis["range"][::-1]} if "range" in axis else {"autorange": "reversed"}
         return axis
+
+    def _span(self, name: str) -> float:
+        """Of the values of bars and curves along an axis; bars begin at 0."""
+        values = [np.zeros(0)]
+        for mark in self._plot.marks:
+            if isinstance(mark, Curve):
+                values.append(np.asarray(mark.x if name == "x" else mark.y, dtype=np.float64))
+            elif isinstance(mark, Bars):
+                values.append(np.append(mark.length, 0.0) if (name == "x") == mark.across else mark.at)
+        every = np.concatenate(values)
+        every = every[np.isfinite(every)]
+        return float(np.ptp(every)) if len(every) else 0.0
 
     def _by_asinh(self, name: str) -> bool:
         return name in self._plot.log and self._plot.linear_within > 0.0

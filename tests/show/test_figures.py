@@ -20,7 +20,7 @@ from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
 from calib.core.arrays import FloatArray
-from calib.core.plot import Arrows, Curve, Figure, Plot, Text, magnified, short
+from calib.core.plot import Arrows, Bars, Curve, Figure, Plot, Text, magnified, short
 from calib.core.verdict import Verdict, Word
 from calib.io.logs import Log, read_log, write_log
 from calib.show.charts import chart
@@ -471,3 +471,11 @@ def test_arrows_have_the_length_that_they_claim() -> None:
         tip = shape[np.argmax(np.linalg.norm(shape, axis=1))]
         expected = times * vector * [1.0, -1.0] * pixels_per_unit
         np.testing.assert_allclose(tip, expected, atol=0.02 * np.linalg.norm(expected) + 0.5)
+
+
+def test_counts_have_ticks_at_whole_numbers_alone() -> None:
+    """Between few of them there were ticks at halves, under the numbers of their neighbours."""
+    for most, step in ((3.0, 1), (40.0, None)):
+        bars = Bars(np.array([0.1, 0.2]), np.array([1.0, most]), 0.1)
+        (panel,) = chart(Figure("t", "", (Plot("x", "views", (bars,), whole="y"),), 2.0))["panels"]
+        assert panel["y"].get("dtick") == step and "dtick" not in panel["x"]
