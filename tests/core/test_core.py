@@ -20,6 +20,7 @@ from calib.core.bounded_yaml import YamlProblem, load
 from calib.core.errors import BadInputError, CalibError, ReaderGoneError, UsageError
 from calib.core.files import check_readable, file_sha256, read_bytes, read_text, read_yaml_mapping
 from calib.core.units import parse_corners, parse_duration_s, parse_length_m, plain_number
+from calib.core.words import number
 from calib.core.writing import check_folder, check_writable, write_atomically
 
 
@@ -348,3 +349,14 @@ def test_constants_in_calls_are_compiled_once() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "1\n"
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [(4.53716, 14499.2, "0"), (-4.5, 14499.2, "0"), (463.27, 123.4, "460"), (14499.2, 14499.2, "14000"),
+     (273.4081, 0.05, "273.408"), (0.1, 12.0, "0"), (123456.0, None, "123456")],
+)  # fmt: skip
+def test_a_value_has_the_digits_that_its_deviation_leaves(
+    value: float, sigma: float | None, text: str
+) -> None:
+    assert number(value, sigma) == text
