@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -325,6 +326,8 @@ def test_pictures_of_each_failure(name: str, right: tuple[str, ...]) -> None:
         _, found = _judged(views, CAMERA.image_size_px, model)
         assert found.word in right, (found.word, found.reasons)
         assert (found.word == "ok") == (name == "good")
+        # A million pixels are no figure.
+        assert not re.search(r"\d{5}", " ".join(found.reasons))
 
 
 def test_outliers_are_rejected_and_named() -> None:

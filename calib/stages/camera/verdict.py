@@ -279,7 +279,8 @@ def _of_projection(fit: Calibration, known: Covariance, inflation: float) -> Ite
             f"Where points were seen the camera predicts pixels to {sigma_px:.2f} px only "
             f"(median standard deviation; {limit:.2f} is good)."
         )
-        if not np.isfinite(sigma_px):
+        # More than the picture's side says as little as infinity.
+        if not sigma_px < max(fit.camera.image_size_px):
             text = "Where points were seen nothing bounds the error of the pixels that the camera predicts."
         yield Finding("poor", text, "Take more pictures, with the board tilted and close.")
 
@@ -297,10 +298,12 @@ def _of_border(fit: Calibration, sturdy: Calibration) -> Iterator[Finding]:
     limit = Limits.border_share * max(fit.camera.image_size_px)
     if len(sigma_px) and (most := float(sigma_px.max())) > limit:
         median = float(np.median(sigma_px))
-        known_to = f"to {most:.1f} px only" if np.isfinite(most) else "without any bound on their error"
+        side = max(fit.camera.image_size_px)
+        known_to = f"to {most:.1f} px only" if most < side else "without any bound on their error"
+        half = f", half of the border is within {median:.1f}" if median < side else ""
         text = (
             f"Somewhere at the picture's border the camera predicts pixels {known_to} (standard deviation; "
-            f"{limit:.1f} is good, half of the border is within {median:.1f})."
+            f"{limit:.1f} is good{half})."
         )
         yield Finding("poor" if median > limit else "remark", text, _IN_CORNERS)
 
