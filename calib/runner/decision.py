@@ -199,14 +199,17 @@ def _weak(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> lis
 
 
 def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> list[str]:
-    out = []
+    lacking: list[str] = []
+    first: list[str] = []
+    then: list[str] = []
     for job in jobs:
         wanted = _RECORD.get(str(job["stage"]))
         if job["status"] == "skipped" and wanted and job["log"] is None:
-            out.append(f"{job['title']}: {wanted}")
-    for job in jobs:
+            lacking.append(f"{job['title']}: {wanted}")
         for name in job["writes"]:
             section = sections.get(name)
             if isinstance(section, dict):
-                out += [f"{job['title']}: {advice}" for advice in section.get("advice") or ()]
-    return list(dict.fromkeys(out))
+                # What means nothing is recorded again before anything is added to it.
+                which = first if job["status"] in _MEANINGLESS else then
+                which += [f"{job['title']}: {advice}" for advice in section.get("advice") or ()]
+    return list(dict.fromkeys([*first, *lacking, *then]))

@@ -352,6 +352,13 @@ def test_weak_points_are_grouped_by_reason() -> None:
     assert decide(told, SECTIONS).weak[1] == "Align, Identify: swing.csv: is in g"
 
 
+def test_what_means_nothing_is_recorded_again_first() -> None:
+    for word, at in (("unidentifiable", 0), ("ok", -1)):
+        told = _whole(intrinsics=word, extrinsics="skipped")
+        record = decide(told, {"camera": {"verdict": word, "advice": ["Tilt the board."]}}).record
+        assert len(record) == 2 and record[at] == "Intrinsics: Tilt the board."
+
+
 def test_the_policy_is_that_of_the_script() -> None:
     values = {
         "version": "1", "summary": {}, "what": "<x>", "feedback": "", "aim": "", "points": 0, "draws": 0,
