@@ -14,6 +14,7 @@ from pathlib import Path
 from calib.core.errors import BadInputError
 from calib.core.files import PICTURES, file_sha256, inside, one_line, shown, slug, to_be
 from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.words import several
 
 _LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
 
@@ -114,9 +115,11 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
             logs.append(LogFile(path, name, columns_of(path, options), _kind(path.name)))
     own = root / "rig.yaml"
     rig = own if own.is_file() and taken(own) else None
+    left_out += _passed_over(root, flat)
     if not (pictures or plane or logs):
         raise BadInputError(
-            f"{shown(root)}: holds no pictures in images/ and no logs in logs/; see calib run --help"
+            f"{shown(root)}: holds no pictures in images/ and no logs in logs/, found "
+            f"{_names(_entries(root)) or 'nothing'}; see calib run --help"
         )
     return Folder(root, pictures, board, plane, plane_board, tuple(logs), rig, tuple(left_out), options)
 
@@ -131,12 +134,45 @@ def _pictures(folder: Path, taken: Callable[[Path], bool]) -> tuple[tuple[Path, 
     return pictures, board if board.exists() and taken(board) else None
 
 
-def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+def _passed_over(root: Path, flat: bool) -> list[str]:
+    """Sentences on files and folders that a person may have meant to be read."""
+    names = ["images", "logs", "rig.yaml", "images/plane", "images/board.yaml", "images/plane/board.yaml"]
+    meant = [root / name for name in (*names, *(["board.yaml"] if flat else []))]
+    said = [
+        f"{_named(path, root)}: was left out, expected the name {one.name}"
+        for one in meant
+        if not (one.exists() or one.is_symlink())
+        for path in _entries(one.parent)
+        if path.name.lower().replace(".yml", ".yaml") == one.name
+    ]
+    folders = [path for path in _entries(root / "images") if path.is_dir()]
+    strange = [path for path in folders if path.name.lower() not in ("plane", "dropped")]
+    if strange:
+        said.append(f"images/: {_names(strange)} left out, folders are not looked into")
+    strange = [path for path in _entries(root / "logs") if path.suffix.lower() not in (*_LOGS, ".yaml")]
+    if strange:
+        *most, last = _LOGS
+        said.append(
+            f"logs/: {_names(strange)} left out, expected logs that end in {', '.join(most)} or {last}"
+        )
+    return said
+
+
+def _names(paths: Iterable[Path]) -> str:
+    return several([one_line(path.name)[:60] for path in paths])
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What a person sees in a folder."""
     if not folder.is_dir():
         return []
     with to_be("listed", folder):
-        found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+        found = [path for path in folder.iterdir() if not path.name.startswith(".")]
     return sorted(found, key=lambda path: path.name)
+
+
+def _listed(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    return [path for path in _entries(folder) if path.suffix.lower() in suffixes]
 
 
 def _kind(name: str) -> str:

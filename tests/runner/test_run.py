@@ -372,6 +372,32 @@ def test_links_out_of_the_folder_are_left_out_and_named(tmp_path: Path) -> None:
     assert [log.slug for log in followed.logs] == ["linked", "one", "two", "within"]
 
 
+def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    assert read_folder(root).left_out == ()
+    for name in ("images/day1", "images/dropped", "logs/tag1", "logs/.git", "notes"):
+        (root / name).mkdir()
+    for name in (
+        "logs/swing1.txt",
+        "logs/columns.yaml",
+        "logs/one.columns.yaml",
+        "images/Thumbs.db",
+        "rig.yml",
+    ):
+        (root / name).write_text("")
+    said = read_folder(root).left_out
+    assert [sentence.split(" left out")[0] for sentence in said] == [
+        "rig.yml: was",
+        "images/: day1",
+        "logs/: swing1.txt, tag1",
+    ]
+    other = tmp_path / "other"
+    (other / "Images").mkdir(parents=True)
+    if not (other / "images").is_dir():
+        with pytest.raises(BadInputError, match="found Images; see"):
+            read_folder(other)
+
+
 @pytest.mark.parametrize("name", ["a\nb", "a..", "-rf", "<script>", "a;b'\"", "é", "x" * 200, "a b"])
 def test_odd_names_stay_inside_and_run(tmp_path: Path, name: str) -> None:
     root, out = make_folder(tmp_path / "rig"), tmp_path / "out"
