@@ -468,12 +468,18 @@ def _parquet_column(source: str, column: Any, name: str) -> FloatArray:
 
 @dataclass(frozen=True)
 class Cells:
-    """A small CSV: its header, rows of cells, and the number of each row's line."""
+    """A small CSV: its header, rows of cells, and the number of each row's line.
+
+    Attributes
+    ----------
+    commas : whether numbers may have a decimal comma, as no comma separates the cells.
+    """
 
     path: Path
     header: list[str]
     rows: list[list[str]]
     lines: list[int]
+    commas: bool = False
 
     def column(self, wanted: str | None, known: Sequence[str], what: str) -> int:
         """Index of a column, the one asked for or the first known name. Raises `BadInputError`."""
@@ -494,7 +500,8 @@ class Cells:
 
     def _number(self, cell: str, line: int, column: int) -> float:
         word = cell.strip()
-        value = plain_number(word) if word else math.nan
+        plain = word.replace(",", ".") if self.commas else word
+        value = plain_number(plain) if word else math.nan
         if value is None:
             raise BadInputError(
                 f"{shown(self.path)}, line {line}: {self.header[column]} is {shown(word[:40])!r}, expected a "
@@ -511,7 +518,11 @@ def read_cells(path: Path, comments: bool = True) -> Cells:
     header: list[str] = []
     rows: list[list[str]] = []
     lines: list[int] = []
-    reader = csv.reader(io.StringIO(read_text(path)))
+    text = read_text(path)
+    lines_of_text = (line.strip() for line in text.splitlines())
+    # Where a decimal comma is usual, spreadsheets put semicolons between the cells.
+    separator = _separator(next((s for s in lines_of_text if s and not (comments and s[0] == "#")), ""))
+    reader = csv.reader(io.StringIO(text), delimiter=separator)
     try:
         for cells in reader:
             if not any(cell.strip() for cell in cells) or (comments and cells[0].lstrip().startswith("#")):
@@ -526,11 +537,9 @@ def read_cells(path: Path, comments: bool = True) -> Cells:
             rows.append(cells)
             lines.append(reader.line_num)
     except csv.Error as error:
-        raise BadInputError(
-            f"{shown(path)}, line {reader.line_num}: is not comma-separated: {error}"
-        ) from error
+        raise BadInputError(f"{shown(path)}, line {reader.line_num}: is no row of cells: {error}") from error
     if not header:
         raise BadInputError(f"{shown(path)}: is empty, expected a header and rows")
     if not rows:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
-    return Cells(path, header, rows, lines)
+    return Cells(path, header, rows, lines, separator != ",")

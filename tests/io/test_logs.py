@@ -20,7 +20,7 @@ from calib.core.errors import BadInputError
 from calib.io import logs, tables
 from calib.io.logs import Log, check_time, iter_log, log_text, read_log, write_log
 from calib.io.states import ENDINGS, STATES, states_writer
-from calib.io.tables import GENERAL, TIME, WHOLE, table_bytes
+from calib.io.tables import GENERAL, TIME, WHOLE, read_cells, table_bytes
 
 SMALL = (
     "t_s,u_px,v_px,ax_mps2,gz_radps,pwm1\n"
@@ -436,3 +436,10 @@ def test_texts_in_parquet_are_refused_before_they_are_unpacked(tmp_path: Path) -
     importlib.import_module("pyarrow.parquet").write_table(table, path, compression="zstd")
     with pytest.raises(BadInputError, match=r"gz_radps holds dictionary<.*, expected numbers"):
         read_log(path)
+
+
+@pytest.mark.parametrize("text", ["# a\nx;y\n0,5;1e-1\n;2\n", "x\ty\n0.5\t0,1\n\t2\n", "x,y\n0.5,0.1\n,2\n"])
+def test_small_tables_as_spreadsheets_save_them(write, text: str) -> None:
+    cells = read_cells(write(text))
+    assert cells.header == ["x", "y"]
+    np.testing.assert_array_equal(cells.numbers(0, 1), [[0.5, 0.1], [np.nan, 2.0]])
