@@ -633,7 +633,16 @@ def opened_bag(path: Path) -> Iterator[Source]:
     except Exception as error:
         # Damaged bytes make the packages raise nearly anything, and which is not part of their interface.
         said = one_line(str(error) or type(error).__name__)[:160]
-        raise BadInputError(f"{source}: is not a bag that can be read: {said}") from error
+        raise BadInputError(
+            f"{source}: is not a bag that can be read: {said}; if its recording was cut, {_mend(path)}"
+        ) from error
+
+
+def _mend(path: Path) -> str:
+    """What mends a bag whose recorder did not end it."""
+    tools = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "sqlite3's .recover"}
+    endings = (file.suffix.lower() for file in (path.iterdir() if path.is_dir() else [path]))
+    return f"mend it with {next((tools[e] for e in endings if e in tools), 'ros2 bag reindex')}"
 
 
 def _module(path: Path, name: str) -> Any:
@@ -711,6 +720,8 @@ class _Mcap:
         else:
             for schema, channel, _ in self._all(None):
                 channels.setdefault(channel.topic, (schema, channel))
+        if self.truncated and not channels:
+            raise BadInputError(f"{shown(path)}: ends within its first messages; {_mend(path)}")
         if len(channels) > _MOST_TOPICS:
             raise BadInputError(f"{shown(path)}: has {len(channels)} topics, expected at most {_MOST_TOPICS}")
         self.topics = tuple(_mcap_topic(name, *channels[name]) for name in sorted(channels))

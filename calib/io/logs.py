@@ -345,6 +345,13 @@ def iter_log(
     from calib.io.serial import STREAMS, stream_text
 
     bag, ending = is_bag(path), path.suffix.lower()
+    if not bag and path.is_dir():
+        parts = sorted(part.name for part in path.iterdir() if part.suffix.lower() in (".db3", ".mcap"))
+        if parts:
+            raise BadInputError(
+                f"{shown(path)}: has no metadata.yaml, which ends the recording of a ROS 2 bag; write it "
+                f"with ros2 bag reindex, or give {shown(parts[0])} itself"
+            )
     if not (bag and path.is_dir()):
         check_readable(path)
     if not bag and options.topics is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -149,6 +150,25 @@ def _refused(path: Path, topics: Path | None = None) -> str:
         read_log(path, LogOptions(topics=topics))
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ("ros1", "rosbag reindex"),
+        ("mcap", "mcap recover"),
+        ("sqlite", r"\.recover"),
+        ("folder", "ros2 bag reindex"),
+    ],
+)
+def test_a_recording_that_was_cut_is_told_what_mends_it(form: str, said: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path, form, readings(np.random.default_rng(3), 0.5))
+    if form == "folder":
+        (path / "metadata.yaml").unlink()
+    else:
+        file = path if path.is_file() else next(path.glob("*.db3"))
+        file.write_bytes(file.read_bytes()[: file.stat().st_size * 3 // 5])
+    assert re.search(said, _refused(path))
 
 
 @pytest.mark.parametrize("form", KINDS_OF_FORMAT)
