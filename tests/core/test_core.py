@@ -172,6 +172,7 @@ BOMBS = {
     "code": ("a: !!python/object/apply:os.system [ls]", "is not YAML: could not determine a constructor"),
     "no boolean": ("a: !!bool maybe", "is not YAML that can be read"),
     "no date": ("a: !!timestamp today", "is not YAML that can be read"),
+    "tab": ("a:\n\tb: 1\n", "line 2: is not YAML: a tab indents the line, expected spaces"),
     "zero byte": ("a: \0", "is not YAML: control characters are not allowed"),
 }
 
