@@ -211,7 +211,9 @@ def writes_through(path: Path) -> bool:
 
 
 def _through(path: Path) -> int | None:
-    """The open descriptor that a path stands for, as /dev/stdout does, whatever that is."""
+    """The open descriptor that a path stands for, as - and /dev/stdout do, whatever that is."""
+    if str(path) == "-":
+        return 1
     place = os.path.abspath(path)  # noqa: PTH100  a link must not be followed here
     if place in ("/dev/stdout", "/dev/stderr"):
         return 1 if place == "/dev/stdout" else 2

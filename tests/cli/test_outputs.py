@@ -166,7 +166,7 @@ def test_states_go_through_pipes(process, environment, place: Path) -> None:
         assert "verdict" in done.stderr
         (place / "kept").unlink(missing_ok=True)
     done = subprocess.run(
-        ["bash", "-o", "pipefail", "-c", f"{command} -o /dev/stdout | head -1"],
+        ["bash", "-o", "pipefail", "-c", f"{command} -o - | head -1"],
         cwd=place, env=environment, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (141, wanted.split("\n", 1)[0] + "\n")
