@@ -24,6 +24,7 @@ from typer.main import get_command
 
 from calib.cli.app import command_line
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
+from calib.core.bounded_yaml import load
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
 from calib.io.columns import COLUMNS
@@ -49,6 +50,13 @@ def blocks(text: str, kind: str) -> Iterator[tuple[int, str]]:
     for match in FENCE.finditer(text):
         if match["kind"] == kind:
             yield text.count("\n", 0, match.start("text")), match["text"]
+
+
+def test_yaml_of_the_manual_is_yaml() -> None:
+    found = [text for path in documents() for _, text in blocks(path.read_text(), "yaml")]
+    assert len(found) > 5
+    for text in found:
+        assert isinstance(load(text), dict), text
 
 
 def without_blocks(text: str) -> str:
