@@ -175,7 +175,8 @@ def test_files_of_opencv_with_more_coefficients() -> None:
         ("[526.69, 0, 312.33, 0,", "[526.69, 0, 312.33,", "camera_matrix.data has 8 numbers, expected 9"),
         ("[526.69, 0, 312.33, 0,", "[.nan, 0, 312.33, 0,", "camera_matrix.data contains nan"),
         ("camera_matrix:", "matrix:", "camera_matrix is missing"),
-        ("image_width: 640", "image_width: [", "not valid YAML at line"),
+        ("image_width: 640", "image_width: [", r"line \d+: is not YAML"),
+        ("camera_matrix:", "camera_matrix: !!opencv-matrix", "import it with calib import opencv"),
     ],
 )
 def test_wrong_ros_files_are_refused_by_key(old: str, new: str, words: str) -> None:

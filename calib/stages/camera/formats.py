@@ -428,11 +428,13 @@ def _matrix(values: FloatArray) -> dict[str, Any]:
 
 
 def _mapping(text: str) -> Mapping[str, Any]:
+    if "!!opencv-matrix" in text:
+        raise BadInputError("is a FileStorage of OpenCV; import it with calib import opencv")
     try:
         document = load(_without_directive(text))
     except YamlProblem as problem:
-        where = "" if problem.line is None else f" at line {problem.line}"
-        raise BadInputError(f"not valid YAML{where}: {problem.said}") from problem
+        where = "" if problem.line is None else f"line {problem.line}: "
+        raise BadInputError(f"{where}{problem.said}") from problem
     if not isinstance(document, dict):
         raise BadInputError(f"expected a YAML mapping, found {type(document).__name__}")
     return document
