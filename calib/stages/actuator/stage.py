@@ -586,7 +586,7 @@ validate = Stage(
 
     A log's commands are played to the original model of the source, to the improved one with nominal
     parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
-    Logs of pressures are played to the section arm, from the first readings alone.
+    Logs of pressures are played to an actuator of the kind pressure_arm, from the first readings alone.
     Exits 0 whatever comes of it.
     """,
     _read_validate,

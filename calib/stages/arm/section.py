@@ -1,4 +1,4 @@
-"""The section `arm` of rig.yaml: a bending arm under a pressure valve that `calib identify` has assembled."""
+"""The kind `pressure_arm` of the section `actuator`: a bending arm that `calib identify` has assembled."""
 
 from __future__ import annotations
 

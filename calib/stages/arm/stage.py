@@ -355,7 +355,7 @@ arm = Stage(
     "Bending arm",
     """Identify a bending arm under a pressure valve from logs of pressures and motion capture.
 
-    Writes the section arm. Exits 1 when the verdict is not ok.
+    Writes the section actuator, of the kind pressure_arm. Exits 1 when the verdict is not ok.
     """,
     _read,
     _solve,
