@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -241,7 +242,10 @@ def _scaled(value: float | None, scale: float) -> float | None:
 
 
 def as_words(name: str) -> str:
-    """A key without its unit."""
+    """A key without its unit, or keys that dots join."""
+    keys = re.split(r"\.(?=[a-zA-Z])", name)
+    if len(keys) > 1:
+        return " ".join(map(as_words, keys))
     end = next((end for end in UNITS if name.endswith(end)), "")
     return name.removesuffix(end).replace("_", " ")
 

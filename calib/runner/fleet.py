@@ -32,6 +32,7 @@ from calib.core.result import Section
 from calib.core.rig import Rig
 from calib.core.schema import validated
 from calib.core.units import unit_of
+from calib.core.words import as_words
 from calib.core.workers import Processes, Task
 from calib.core.writing import make_folder
 from calib.io.tables import read_cells
@@ -1072,8 +1073,8 @@ def _looks(
     looks = []
     for _, _, i in heapq.nsmallest(_MOST_LOOKS, ranked):
         z = float(worst[i]) if np.isfinite(worst[i]) else None
-        why = [sentences[i]] if sentences[i] else []
+        why = [sentences[i].removesuffix(".")] if sentences[i] else []
         if z is not None and z > limit:
-            why.append(f"{which[i]} is {z:.1f} standard deviations from the fleet's median")
+            why.append(f"{as_words(which[i] or '')} is {z:.1f} standard deviations from the fleet's median")
         looks.append(Look(names[i], serials[i], verdicts[i], "; ".join(why), z))
     return tuple(looks), len(ranked)

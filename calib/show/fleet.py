@@ -26,7 +26,7 @@ from calib.show.page import embedded, render
 
 def constant_figure(one: ConstantSummary) -> Figure:
     """How a constant is spread over the rigs, and what it does with the serial number."""
-    name, unit = as_words(one.name).replace(".", " "), f" {one.unit}" if one.unit else ""
+    name, unit = as_words(one.name), f" {one.unit}" if one.unit else ""
     value = f"{name} ({one.unit})" if one.unit else name
     width = (one.high - one.low) / max(len(one.counts), 1)
     at = one.low + width * (np.arange(len(one.counts)) + 0.5)
@@ -116,7 +116,7 @@ def fleet_page_text(summary: FleetSummary) -> str:
 def _answer(summary: FleetSummary) -> tuple[str, str]:
     bad = sum(count for verdict, count in summary.verdicts.items() if _KIND.get(verdict) == "failed")
     standing = sum(one.standing_out for one in summary.constants)
-    drifting = [one.name for one in summary.constants if one.drifts]
+    drifting = [as_words(one.name) for one in summary.constants if one.drifts]
     parts = []
     if bad:
         parts.append(f"{bad} of {summary.rigs} rigs ha{'ve' if bad > 1 else 's'} no result")
@@ -166,7 +166,7 @@ def _card(one: ConstantSummary) -> dict[str, Any]:
     """A constant as the page shows it."""
     out = [(name, number(value, one.spread.scale or None), f"{z:+.1f}") for name, value, z in one.out[:8]]
     return {
-        "name": one.name,
+        "name": as_words(one.name),
         "facts": _facts(one),
         "figure": embedded(constant_figure(one)),
         "drifts": one.drifts,
@@ -259,4 +259,4 @@ def _cloud(name: str, measure: str, points: tuple[tuple[float, float], ...]) -> 
 def _headed(name: str) -> str:
     """A key as the name of an axis."""
     unit = unit_of(name)
-    return as_words(name).replace(".", " ") + (f" ({unit})" if unit else "")
+    return as_words(name) + (f" ({unit})" if unit else "")

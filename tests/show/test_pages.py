@@ -414,7 +414,7 @@ def test_whole_harmless_and_told() -> None:
     assert sum(tag == "script" for tag, _ in outline.tags) == 7 + 2
     assert not [tag for tag, _ in outline.tags if tag == "img"]
     assert not re.search(r"https?://", text.replace(library(), ""))
-    assert "1 of 60 rigs has no result" in text and "camera.fx_px drifts" in text
+    assert "1 of 60 rigs has no result" in text and "camera fx drifts" in text
     # The worst first: the one without a result, then the one that stands out.
     assert text.index("rig3</td>") < text.index("rig7</td>")
     assert fleet_page_text(found) == fleet_page_text(_summary(60))
@@ -433,10 +433,16 @@ def test_in_a_browser(tmp_path: Path) -> None:
         assert browser.run("document.title") == "Fleet of 60 rigs"
         browser.run(_TO_EACH)
         assert browser.run("document.querySelectorAll('.card .js-plotly-plot .main-svg').length") >= 7
+        browser.size(390)
+        (*_, why) = browser.run(
+            "[...document.querySelectorAll('.looks td')].map(e => e.getBoundingClientRect().right)"
+        )
+        assert 300 < why <= 390
+        browser.size(1100)
         browser.run("document.querySelectorAll('#table th button')[2].click()")
         sort = "document.querySelectorAll('#table th')[2].getAttribute('aria-sort')"
         assert browser.run(sort) == "ascending"
-        typed = "(() => { const e = document.getElementById('filter'); e.value = 'fx_px';"
+        typed = "(() => { const e = document.getElementById('filter'); e.value = 'fx drifts';"
         browser.run(f"{typed} e.dispatchEvent(new Event('input')); }})()")
         assert browser.run("document.querySelectorAll('.card:not([hidden])').length") == 1
     finally:
