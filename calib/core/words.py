@@ -71,9 +71,10 @@ def number(value: float | None, sigma: float | None = None, places: int | None =
         return str(value)
     if sigma is not None and math.isfinite(sigma) and sigma > 0.0:
         places = 1 - math.floor(math.log10(sigma))
-        if -9 <= places < 0 and abs(value) < 1e9:
-            # Tens and hundreds that the deviation leaves open are no digits either.
-            return f"{round(value, places) + 0.0:.0f}"
+        if places < 0 and 0.0 < abs(value) < 1e9:
+            # Tens and hundreds that the deviation leaves open are no digits either, but for two of the value.
+            places = max(places, 1 - math.floor(math.log10(abs(value))))
+            return f"{round(value, places):.{max(places, 0)}f}"
         if not (0 <= places <= 12 and abs(value) < 1e9):
             places = None
     return f"{value:.6g}" if places is None else f"{value:.{places}f}"

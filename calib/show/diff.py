@@ -21,6 +21,9 @@ from calib.stages.camera.plots import panel_height_in, picture
 from calib.stages.camera.section import Camera
 
 _ACROSS = 33
+_NOTHING = 1e-6
+"""Differences in px or mm below this are rounding's."""
+_SAME = "no difference"
 _BAR = 0.5**0.5
 """Of a length over sqrt(2): the root mean square of its two coordinates, whose sigma is that of one."""
 
@@ -96,8 +99,12 @@ def _over_picture(before: Camera, after: Camera) -> Figure:
     def map_of(values: FloatArray | None, word: str, unit: str, scale: tuple[float, float] | None) -> Plot:
         if values is None:
             return picture(size, (), word, "the covariance of this camera is not known")
+        if np.all(values == 0.0):
+            return picture(size, (), word, _SAME)
         return picture(size, (Field(u, v, values, unit, unit, scale=scale, even=True),), word)
 
+    # What rounding leaves is no map.
+    apart[np.abs(apart) < _NOTHING] = 0.0
     length = np.linalg.norm(apart, axis=-1)
     note = "Above are maps of the standard deviation of one coordinate, below of the difference."
     finite = length[np.isfinite(length)]
@@ -135,6 +142,8 @@ def _arrowed(panel: Plot, x: FloatArray, y: FloatArray, apart: FloatArray, unit:
     at = np.stack(np.meshgrid(x, y), axis=-1)[::step, ::step].reshape(-1, 2)
     along = apart[::step, ::step].reshape(-1, 2)
     longest = float(np.nanmax(length)) if np.isfinite(length).any() else 0.0
+    if np.all(length == 0.0):
+        return replace(panel, empty=_SAME)
     times = magnified(0.9 * step * abs(float(x[1] - x[0])), longest)
     marks = (Field(x, y, length, unit, unit, even=True), Arrows(at, along, times, unit, "red"))
     return replace(panel, marks=(*marks, *panel.marks), title=f"{panel.title}; arrows drawn {times:g} times")
@@ -147,11 +156,14 @@ def _on_plane(before: Rig, after: Rig, found: RigDiff) -> Figure:
     world = grid_m((x0, y0, x1, y1))
     pixels = before.plane.to_pixels(world.reshape(-1, 2), before.camera)
     apart = 1e3 * (after.plane.to_world(pixels, after.camera).reshape(world.shape) - world)
+    apart[np.abs(apart) < _NOTHING] = 0.0
     x, y = 1e3 * world[0, :, 0], 1e3 * world[:, 0, 1]
     limits = (1e3 * x0, 1e3 * x1), (1e3 * y0, 1e3 * y1)
     blank = Plot("x (mm)", "y (mm)", (), "Difference, mm", *limits, grid="", equal=True, down=True)
     plane = found.plane
-    most, mean = rounded(plane.largest_mm, "mm", 2), rounded(plane.mean_mm, "mm", 2)
+    most, mean = (
+        rounded(one if one > _NOTHING else 0.0, "mm", 2) for one in (plane.largest_mm, plane.mean_mm)
+    )
     note = f"It is read up to {most} apart, {mean} on average"
     if plane.sigma_mm:
         note += (

@@ -354,8 +354,8 @@ def test_constants_in_calls_are_compiled_once() -> None:
 
 @pytest.mark.parametrize(
     ("value", "sigma", "text"),
-    [(4.53716, 14499.2, "0"), (-4.5, 14499.2, "0"), (463.27, 123.4, "460"), (14499.2, 14499.2, "14000"),
-     (273.4081, 0.05, "273.408"), (0.1, 12.0, "0"), (123456.0, None, "123456")],
+    [(4.53716, 14499.2, "4.5"), (560.03, 14499.2, "560"), (463.27, 123.4, "460"), (14499.2, 14499.2, "14000"),
+     (273.4081, 0.05, "273.408"), (0.1, 12.0, "0"), (0.0, 120.0, "0"), (123456.0, None, "123456")],
 )  # fmt: skip
 def test_a_value_has_the_digits_that_its_deviation_leaves(
     value: float, sigma: float | None, text: str

@@ -94,6 +94,14 @@ def test_the_page_shows_both_in_px_and_mm(tmp_path: Path) -> None:
         browser.close()
 
 
+def test_of_the_same_camera_no_rounding_is_mapped() -> None:
+    before, after = _rig(), _rig()
+    assert after.camera is not None
+    after.camera.fx_px *= 1.0 + 1e-15
+    text = diff_page_text(before, after, ("a", "b"), before.diff(after))
+    assert text.count("no difference") == 3 and "up to 0 px elsewhere" in text and "read up to 0 mm" in text
+
+
 @pytest.mark.parametrize("other", [_rig(size=(640, 480)), Rig(), _rig().with_sections({"plane": None})])
 def test_what_cannot_be_compared_is_said(other: Rig) -> None:
     before = _rig()
