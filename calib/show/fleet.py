@@ -224,6 +224,7 @@ def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
         version=__version__,
         summary=summary,
         what=what,
+        measure=as_words(summary.measure),
         feedback=base.feedback,
         aim="the least is best" if spec.near is None else f"the nearest to {spec.near:g} is best",
         points=spec.points,
@@ -235,7 +236,8 @@ def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
 
 def _heads(summary: SweepSummary, points: tuple[Point, ...]) -> list[str]:
     others = [name for name in summary.measures if name != summary.measure]
-    return ["point", *points[0].parameters, f"{summary.measure}, median", "worst draw", *others]
+    parameters, rest = map(_headed, points[0].parameters), map(_headed, others)
+    return ["point", *parameters, f"{_headed(summary.measure)}, median", "worst draw", *rest]
 
 
 def _sweep_page_row(point: Point) -> list[tuple[str, Any]]:

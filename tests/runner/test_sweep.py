@@ -17,6 +17,7 @@ from calib.runner import sweep as sweeping
 from calib.runner.outcomes import column, opened_store, texts
 from calib.runner.processes import Here
 from calib.runner.sweep import Base, Case, Sweep, cases, read_sweep, run_sweep, summarise_sweep
+from calib.show.fleet import sweep_page_text
 
 _BASE = "base: {controller: pid, reference: jump}\n"
 
@@ -105,6 +106,9 @@ def test_best_worst_and_resumed(tmp_path: Path) -> None:
         assert (best.draws, best.median, best.worst) == (3, pytest.approx(0.01), pytest.approx(0.02))
         assert best.measures == {"error": pytest.approx(0.01)}
         assert found.best[0].loss < found.best[-1].loss and not found.worst
+        # The page speaks in words.
+        page = sweep_page_text(SPEC, found)
+        assert "scenario Kp" in page and "scenario.Kp" not in page and "Error over each parameter" in page
         table = pyarrow.parquet.read_table(tmp_path / "out" / "sweep.parquet")
         assert table.num_rows == 24
         np.testing.assert_equal(column(table, "case"), np.arange(24.0))

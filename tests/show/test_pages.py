@@ -362,7 +362,7 @@ def test_what_means_nothing_is_recorded_again_first() -> None:
 def test_the_policy_is_that_of_the_script() -> None:
     values = {
         "version": "1", "summary": {}, "what": "<x>", "feedback": "", "aim": "", "points": 0, "draws": 0,
-        "tables": [], "clouds": [],
+        "tables": [], "clouds": [], "measure": "m",
     }  # fmt: skip
     values["summary"] = {"cases": 1, "failed": 0, "why": "", "measure": "m", "as_before": 0}
     text = render("sweep.html.j2", ("page.css",), ("common.js",), False, **values)
