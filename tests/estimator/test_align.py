@@ -79,6 +79,14 @@ def test_swing_and_ellipse_align_a_rig() -> None:
         assert abs(np.nanmean(before)) > 5.0 * abs(np.nanmean(after))
 
 
+def test_a_swing_between_readings_of_a_slow_imu_is_no_scale() -> None:
+    """At 50 Hz a light head swings with eight readings a period."""
+    nominal = SimulatedRig()
+    light = replace(nominal.plant, mass_kg=0.01, inertia_kgm2=0.6 * nominal.plant.inertia_kgm2)
+    trial = known(replace(nominal, plant=light, imu=replace(nominal.imu, rate_hz=50.0)))
+    assert np.abs(scores(trial, _found(trial, MOTIONS[:2], 1))).max() < 3.0
+
+
 def test_at_rest_only_the_sum_is_known() -> None:
     trial = known(SimulatedRig())
     log = align_log(twin_log(trial.rig, "static", {}, 5, 15.0))

@@ -364,6 +364,9 @@ _PHI_SIGMA = 0.012
 _WORTH = 60.0
 _TIMES_IN_DEGREES = (0.5 / 57.3, 2.0 / 57.3)
 _MARGIN_S = 0.06
+_MOST_SPAN_S = 0.021
+"""Longest span of knots, however seldom the IMU is read: with 0.04 s the splines miss the accelerations of a
+swing at 4 Hz by more than their noise, which scales and marker then take up."""
 _LOCAL_S = 1.0
 _MEANS = 5
 _REST_FACTOR = 2.0
@@ -659,7 +662,7 @@ def _stretch(piece: Piece, offset_s: float) -> Stretch | None:
     use = inside & piece.fine
     if inside.sum() < _LEAST_PICTURES or use.sum() < _LEAST_PICTURES // 2:
         return None
-    span = float(np.clip(2.0 * piece.imu.period_s, 0.005, 0.04))
+    span = max(min(2.0 * piece.imu.period_s, _MOST_SPAN_S), piece.imu.period_s, 0.005)
     knots = Knots.over(first - _MARGIN_S, last + _MARGIN_S, span)
     t = exposed[use]
     known = np.isfinite(piece.readings[:, 2])
