@@ -7,15 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimatorlogs import SIGMA, rows_from, setup_for, simulated, truth, truth_of_sensors
+from estimatorlogs import SIGMA, rows_from, setup_for, simulated, truth, truth_of_sensors, varied
 
 from calib.io.logs import Log
 from calib.stages.estimator import smoother
 from calib.stages.estimator.consistency import Tally
-from calib.stages.estimator.kinematic import Filter, Start
+from calib.stages.estimator.kinematic import FLAGS, OUT, Filter, Start
 from calib.stages.estimator.read import periods
 from calib.stages.estimator.replay import smooth_log
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
+from calib.twin.scenarios import make_scenario, run_scenario
+from calib.twin.simulate import log_of
 
 
 @pytest.mark.parametrize("name", ["swing", "ellipse", "elongation"])
@@ -86,6 +88,22 @@ def test_windows_hardly_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     cut = smoother.smooth(setup, rows, filtered)
     assert np.abs(cut[:, 1] - whole[:, 1]).max() < 0.5 * np.median(whole[:, 10])
     np.testing.assert_allclose(np.median(cut[:, 10]), np.median(whole[:, 10]), rtol=0.2)
+
+
+def test_where_the_filter_begins_again_the_smoother_does() -> None:
+    """A light head swings too fast for 30 pictures and 50 samples a second, until half its angle is gone."""
+    rig = varied(2)
+    light = replace(rig.plant, mass_kg=0.6 * rig.plant.mass_kg, inertia_kgm2=0.6 * rig.plant.inertia_kgm2)
+    rig = replace(rig, plant=light, imu=replace(rig.imu, rate_hz=50.0))
+    log = log_of(run_scenario(make_scenario("swing", {"phi_rad": "0.45"}), rig, 2, "sensors"))
+    rows = rows_from(log)
+    kept = np.ones(len(rows), dtype=np.bool_)
+    kept[np.flatnonzero(rows.kinds & 1)[1::2]] = False
+    rows, setup = rows[kept], replace(setup_for(rig, 2), camera_period_s=1.0 / 30.0)
+    filtered = Filter(setup).run(rows)
+    off = smoother.smooth(setup, rows, filtered)[:, 1:3] - truth(log)[kept, :2]
+    assert (filtered[:, OUT.index("flags")].astype(int) & FLAGS["restarted"]).any()
+    assert np.abs(off[rows.t_s > 2.0]).max() < 2e-4
 
 
 def cut(log: Log, pieces: int) -> Iterator[Log]:

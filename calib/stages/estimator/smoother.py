@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -347,14 +348,35 @@ def one_level(setup: Setup, rows: Rows, events: Events) -> OneLevel:
     return kept
 
 
+def _begun_again(outputs: FloatArray) -> list[int]:
+    """Rows at which the filter takes a picture again, which it had rejected until it started again."""
+    gated, flags = (outputs[:, OUT.index(name)] for name in ("gated_camera", "flags"))
+    restarts = np.cumsum(flags.astype(np.int64) & FLAGS["restarted"])
+    seen = np.flatnonzero(np.isfinite(gated))
+    good = np.flatnonzero(gated[seen] == 0.0)
+    before, after = seen[good[:-1]], seen[good[1:]]
+    some = (np.diff(good) > 1) & (restarts[after] > restarts[before])
+    return [int(row) for row in after[some]]
+
+
 def smooth(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
     """Smoothed estimates (n, len(OUT)) at the rows' stamps.
+
+    Where the filter began again at a picture the smoother does, too: one that has lost the head rejects all
+    that follows.
 
     Parameters
     ----------
     outputs : (n, len(OUT)) of the filter on the same rows; what it says of innovations and flags is kept, and
         all that it says where both sides of a row make the head faster than a rig.
     """
+    cuts = [0, *_begun_again(outputs), len(rows)]
+    parts = [slice(begin, end) for begin, end in pairwise(cuts)]
+    return np.concatenate([_smooth_part(setup, rows[part], outputs[part]) for part in parts])
+
+
+def _smooth_part(setup: Setup, rows: Rows, outputs: FloatArray) -> FloatArray:
+    """`smooth` of rows between which the filter does not begin again."""
     events = events_of(setup, rows)
     levels, walk = setup.process.arrays()
     x, P, w = starting_state(setup, rows)
