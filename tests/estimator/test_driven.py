@@ -359,6 +359,16 @@ def test_a_bias_of_the_innovations_takes_the_word_away_and_it_comes_back() -> No
     np.testing.assert_array_equal(halves, weight)
 
 
+@pytest.mark.parametrize("right", ["driven", "kinematic"])
+def test_a_filter_that_rejects_what_the_other_expects_loses_its_word(right: str) -> None:
+    driven, other = innovations(120, 1), innovations(120, 1)
+    lost = other if right == "driven" else driven
+    lost[:, OUT.index("gated_camera")] = 1.0
+    weight = np.empty(120)
+    weigh(driven, other, new_handover(), 0.0, weight)
+    assert abs(weight[-1] - (right == "driven")) < 1e-3
+
+
 def some(seed: int = 0) -> tuple[FloatArray, FloatArray, Model]:
     """State, covariance, and what does not change."""
     setup, drive = setup_for(varied_drive(1)), Drive()

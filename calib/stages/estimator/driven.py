@@ -1553,7 +1553,8 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outpu
 # a wrong model of the plant may still predict better than one that knows nothing. So the driven filter must
 # agree with itself as well: over what is in memory the mean of each sensor's innovations, which a wrong force
 # moves first, and their mean square are chi-square, and what they exceed that by is taken from s. A restart
-# or a reading that only the driven filter rejects counts against it too.
+# or a reading that only the driven filter rejects counts against it too, a picture that only the kinematic
+# one rejects for it.
 #
 # Means are mixed by the weight, and what they differ by is added to the covariance.
 
@@ -1617,6 +1618,8 @@ def weigh(
             memory[1] += min(max(difference, -CUT), CUT)
         elif gated == 1.0 and other == 0.0:
             memory[1] -= CUT
+        elif gated == 0.0 and other == 1.0:
+            memory[1] += CUT
         for sensor in range(3):
             at, e = 2 + 4 * sensor, _E + 2 * sensor
             if driven[row, _GATED + sensor] == 0.0:
