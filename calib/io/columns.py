@@ -132,6 +132,9 @@ _FASTEST_RADPS = 45.0
 _LARGEST_BIAS_RADPS = 0.35
 _LOUDEST_RADPS, _QUIETEST_RADPS = 0.02, 1.5e-4
 """Spread of a gyroscope at rest: no sensor is louder, and none of those on cheap boards is quieter."""
+_ROUGH = 0.1
+"""Share of a spread that its fourth differences show: 1 of white noise, 0.27 of noise that is low-passed at
+2 Hz of 100, 0.04 at most of a swing with eight readings a period."""
 _QUIET_RADPS = 0.005
 """Spread at rest of those on cheap boards; one that is in deg/s is quieter than that in none."""
 _REST_RAD = 0.02
@@ -889,7 +892,9 @@ def _implausible(
         bias = scale * float(np.abs(np.median(calm, axis=(0, 1))).max())
         if bias > _LARGEST_BIAS_RADPS:
             return f"has a bias of {bias:.3g} rad/s at rest"
-        if float(spread.max()) > _LOUDEST_RADPS:
+        # A slow swing, which an accelerometer hardly feels, is no noise: that lives in differences as well.
+        rough = scale * np.median(np.diff(calm, 4, axis=1).std(axis=1), axis=0) / math.sqrt(70.0)
+        if ((spread > _LOUDEST_RADPS) & (rough > _ROUGH * spread)).any():
             return f"is never quieter than {float(spread.max()):.3g} rad/s"
         if 0.0 < float(spread.max()) < _QUIETEST_RADPS and not any(
             columns.sources[name].unit for name in names

@@ -233,6 +233,16 @@ def test_a_large_bias_at_rest_is_no_turn(tmp_path: Path, names: list[str]) -> No
     assert np.allclose(log.columns["gz_radps"], values[:, 5], atol=1e-6)
 
 
+def test_a_pendulum_that_the_accelerometer_does_not_feel_is_no_loud_gyroscope(tmp_path: Path) -> None:
+    """Two swings a second at 50 Hz, in which the head's acceleration is that of gravity along its path."""
+    t, values = _imu(moving=False)
+    t = 0.02 * np.arange(250)
+    values = values[: len(t)]
+    values[:, 5] += 0.5 * np.exp(-0.3 * t) * np.cos(12.6 * t)
+    log = read_log(_written(tmp_path / "log.csv", ["t_s", *AXES], [t, *values.T]))
+    assert np.allclose(log.columns["gz_radps"], values[:, 5], atol=1e-6)
+
+
 def test_a_unit_that_a_person_states(tmp_path: Path) -> None:
     t, values = _imu()
     columns = [t, *(values[:, :3] / G).T, *(values[:, 3:] / DEGREE).T]
