@@ -10,7 +10,8 @@ moves code leaves the goldens as they are; a commit that changes what a user see
 Everything is driven through `python -m calib` in processes of their own, forked from one that has loaded the
 libraries, and nothing of `calib` is imported, so that modules can move without a change here. The words of
 a command are part of its golden: exit code, stdout, stderr, and the files that it wrote. Text must be
-equal, spaces included. Numbers are equal to 1e-9 of their size on x86-64 (`RELATIVE`, `FLOOR`); where
+equal, spaces included. Numbers are equal to 1e-9 of their size on x86-64 with the numpy and scipy that
+`.[test]` installs (`RELATIVE`, `FLOOR`); where
 processors differ by more than that, a rule in `LOOSE` says so and why. Times taken, the program's version,
 hashes and folders are replaced by marks before anything is stored. Of a states file every 50th row is kept,
 of a page its
