@@ -495,13 +495,6 @@ def _calib(*words: str, cwd: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def _words_and_numbers(text: str) -> tuple[list[str], list[float]]:
-    """What stands between the decimal numbers of C, without the hash of all values; and the numbers."""
-    text = re.sub(r"(SHA-256 of the values:|CALIB_ID(?: !=)?) \w+", r"\1", text)
-    parts = re.split(r"(-?\d+\.\d+(?:e[-+]\d+)?)", text)
-    return parts[::2], [float(one) for one in parts[1::2]]
-
-
 def test_the_shipped_pictures_give_the_shipped_firmware(tmp_path: Path, project_root: Path) -> None:
     rig = str(tmp_path / "rig.yaml")
     _calib("intrinsics", "images", "--rig", rig, cwd=project_root)
@@ -511,11 +504,7 @@ def test_the_shipped_pictures_give_the_shipped_firmware(tmp_path: Path, project_
     folder = project_root / "firmware_constants"
     assert sorted(p.name for p in made.iterdir()) == sorted(p.name for p in folder.iterdir())
     for path in made.iterdir():
-        words, numbers = _words_and_numbers(path.read_text())
-        kept_words, kept = _words_and_numbers((folder / path.name).read_text())
-        assert words == kept_words, path.name
-        # Other releases of numpy and scipy round otherwise, which moves a float by one step at most.
-        np.testing.assert_allclose(numbers, kept, rtol=2.0**-23, err_msg=path.name)
+        assert (folder / path.name).read_bytes() == path.read_bytes(), path.name
     shipped = folder / "calib_constants.h"
     text = shipped.read_text()
     focal = re.search(r"CALIB_CAMERA_FX_PX (\S+)f", text)
