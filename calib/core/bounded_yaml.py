@@ -39,10 +39,7 @@ def load(text: str, loader: Any = None) -> Any:
         mark = getattr(error, "problem_mark", None)
         said = getattr(error, "problem", None) or getattr(error, "reason", None) or "not readable"
         line = None if mark is None else mark.line + 1
-        if (
-            mark is not None
-            and "".join(text.splitlines()[mark.line : mark.line + 1])[mark.column :][:1] == "\t"
-        ):
+        if mark is not None and text[mark.index : mark.index + 1] == "\t":
             said = "a tab indents the line, expected spaces"
         raise YamlProblem(f"is not YAML: {' '.join(str(said).split())}", line) from error
     except (RecursionError, ValueError, LookupError, AttributeError, TypeError) as error:

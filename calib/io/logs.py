@@ -412,13 +412,10 @@ def read_log(
     if not blocks:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
     first = blocks[0]
-    # A column at a time, so that nothing but one of them is there twice.
-    parts = [dict(block.columns) for block in blocks]
-    blocks = [replace(block, columns={}) for block in blocks]
     log = replace(
         first,
         t_s=np.concatenate([block.t_s for block in blocks]),
-        columns={name: np.concatenate([part.pop(name) for part in parts]) for name in first.columns},
+        columns={name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
         lines=np.concatenate([block.lines for block in blocks]),
         passed=sum((block.passed for block in blocks), ALL_TAKEN),
     )
@@ -660,7 +657,7 @@ class Watch:
             if len(finite):
                 least, most = min(least, float(finite.min())), max(most, float(finite.max()))
             self._seen[name] = count + len(finite), least, most
-        if len(pictures := log.sampled("u_px", "v_px")):
+        if "u_px" in self.names and len(pictures := log.sampled("u_px", "v_px")):
             seen = np.stack([log.columns[name][pictures] for name in ("u_px", "v_px")])
             self._pictures += len(pictures)
             self._same += int(np.count_nonzero((np.diff(seen) == 0.0).all(axis=0)))
