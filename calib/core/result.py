@@ -27,7 +27,7 @@ from pydantic import (
 from calib.core.errors import BadInputError
 from calib.core.files import quoted, sha256
 from calib.core.schema import contradiction
-from calib.core.verdict import Verdict, Word
+from calib.core.verdict import Finding, Verdict, Word
 
 if TYPE_CHECKING:
     from calib.core.words import Block
@@ -199,6 +199,14 @@ class Result(Section):
         if new:
             self.word_ = "poor" if self.word_ == "ok" else self.word_
             self.reasons_ = [*self.reasons_, *new]
+
+    def find(self, finding: Finding) -> None:
+        """Add what is found only once the result is there."""
+        if finding.severity == "remark":
+            self.remarks_ = [*self.remarks_, finding.text]
+        else:
+            self.doubt([finding.text])
+        self.advice_ = [*self.advice_, *([finding.advice] if finding.advice else [])]
 
     def sealed(self, written: str = "") -> str:
         """SHA-256 of the values that its verb wrote: `written` if given, else of those at the first call."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from calib.core.errors import BadInputError, CalibError, SomeFailedError, end_of
 from calib.core.files import hash_of, shown
 from calib.core.options import NoOptions
-from calib.core.verdict import Verdict
+from calib.core.verdict import Finding, Verdict
 from calib.core.words import Block, described
 
 if TYPE_CHECKING:
@@ -53,13 +53,17 @@ def _silent(label: str) -> Iterator[ProgressCall]:
     yield lambda done, total: None
 
 
+_MANY = 0.2
+"""Share of the files from which on leaving them out says that something is wrong with the whole."""
+
+
 @dataclass
 class Files:
     """What a stage may read, and who hears about it.
 
     Attributes
     ----------
-    paths : what a person named.
+    named : what a person named. paths : the same without what is `left_out`.
     rig_path : the rig's file, for sentences.
     output : where -o leads, None without.
     figures : whether what figures are drawn from is wanted. keep : whether arrays are wanted in memory that a
@@ -70,6 +74,7 @@ class Files:
     written : names of the files that the outcome was written to beside rig.yaml.
     merged : sections whose earlier values go into the outcome as they are.
     failed : by the path of a file that could not be worked on, the exit code that it alone would have.
+    left_out : why a file that a person named cannot be used beside others, by its path.
     """
 
     paths: tuple[Path, ...] = ()
@@ -82,8 +87,13 @@ class Files:
     written: list[str] = field(default_factory=list)
     merged: tuple[str, ...] = ()
     failed: dict[Path, int] = field(default_factory=dict)
+    left_out: dict[Path, BadInputError] = field(default_factory=dict)
     figures: bool = True
     keep: bool = True
+    named: tuple[Path, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.named = self.paths
 
     @contextmanager
     def one_of_several(self, path: Path) -> Iterator[None]:
@@ -107,8 +117,34 @@ class Files:
         if self.failed:
             names = ", ".join(shown(path.name) for path in self.failed)
             raise SomeFailedError(
-                f"{len(self.failed)} of {len(self.paths)} files failed: {names}", max(self.failed.values())
+                f"{len(self.failed)} of {len(self.named)} files failed: {names}",
+                max(self.failed.values()),
             )
+
+    def leave_out(self, error: BadInputError) -> bool:
+        """Whether the work can begin anew without the one file that a sentence begins with.
+
+        It cannot where that leaves less than half of the files, and for a name that leads nowhere, which a
+        person has mistyped.
+        """
+        said, starts = str(error), (": ", ", line ")
+        named = [
+            path
+            for path in self.paths
+            if any(
+                said.startswith(f"{name}{then}")
+                for name in {shown(path), shown(path.name)}
+                for then in starts
+            )
+        ]
+        many = 2 * (len(self.left_out) + 1) > len(self.named)
+        if len(named) != 1 or many or not named[0].exists():
+            return False
+        self.left_out[named[0]] = error
+        self.paths = tuple(path for path in self.paths if path != named[0])
+        self.hashes.clear()
+        self.remarks.clear()
+        return True
 
     def taken(self, path: Path) -> str:
         """Note that a file is an input; its name without folders, the same wherever the folder lies."""
@@ -157,7 +193,8 @@ class Stage:
     solve : mathematics; a `Result`, a tuple of them in the order of `writes`, or a list of others.
     options : a dataclass of `option` fields.
     sources : help for the paths on the command line, "" for a stage without. several : whether there may
-        be many. optional : whether there may be none.
+        be many. leaves_out : whether one that cannot be used is left out, where others can.
+        optional : whether there may be none.
     writes : sections of rig.yaml. parts : those of an outcome that is a list.
     on_request : option without which nothing is written into rig.yaml.
     needs : sections without which it cannot run. uses : those that it reads where they are.
@@ -175,6 +212,7 @@ class Stage:
     options: type[Any] = NoOptions
     sources: str = ""
     several: bool = True
+    leaves_out: bool = False
     optional: bool = False
     metavar: str = ""
     writes: tuple[str, ...] = ()
@@ -193,39 +231,80 @@ class Stage:
 
         Raises `BadInputError` where a section is missing, or where the answer is none that rig.yaml holds.
         """
-        from pydantic import ValidationError
-
         for name in self.needs:
             rig.needed(name, files.rig_path)
+        told: set[str] = set()
+        while True:
+            try:
+                outcome = self._once(files, rig, options, told)
+                break
+            except BadInputError as error:
+                if self.leaves_out and files.leave_out(error):
+                    continue
+                if files.left_out:
+                    raise next(iter(files.left_out.values())) from error
+                raise
+        results, doubts = self.results(outcome), [*rig.doubts(files.hashes), *rig.retyped(files.merged)]
+        for result in results:
+            result.made_by(self.name, files.hashes).doubt(doubts)
+        self._tell_left_out(files, outcome)
+        for section in self.sections(outcome).values():
+            section.sealed()
+        for sentence in () if results else doubts:
+            files.narrate(sentence)
+        return outcome
+
+    def _once(self, files: Files, rig: Rig, options: Any, told: set[str]) -> Any:
+        from pydantic import ValidationError
+
         inputs = self.read(files, rig, options)
         for sentence in files.remarks:
-            files.narrate(sentence)
+            if sentence not in told:
+                files.narrate(sentence)
+        told.update(files.remarks)
         try:
-            outcome = self.solve(inputs)
+            return self.solve(inputs)
         except ValueError as error:
             # A fit to nonsense can end anywhere: with values that no section holds, or in a singular matrix.
             from numpy.linalg import LinAlgError
 
             if not isinstance(error, ValidationError | LinAlgError):
                 raise
-            told = ""
+            what = ""
             if isinstance(error, ValidationError):
                 first = error.errors()[0]
                 key, value = ".".join(str(part) for part in first["loc"]), first["input"]
-                told = f", {key} came out as {value:.6g}" if isinstance(value, int | float) else ""
+                what = f", {key} came out as {value:.6g}" if isinstance(value, int | float) else ""
             names = ", ".join(shown(path) for path in files.paths)
             which = "; one of them may be of another rig or spoilt: leave them out in turn"
             raise BadInputError(
-                f"{names}: no useful answer follows{told}{which if len(files.paths) > 1 else ''}"
+                f"{names}: no useful answer follows{what}{which if len(files.paths) > 1 else ''}"
             ) from error
-        results, doubts = self.results(outcome), [*rig.doubts(files.hashes), *rig.retyped(files.merged)]
-        for result in results:
-            result.made_by(self.name, files.hashes).doubt(doubts)
-        for section in self.sections(outcome).values():
-            section.sealed()
-        for sentence in () if results else doubts:
-            files.narrate(sentence)
-        return outcome
+
+    def _tell_left_out(self, files: Files, outcome: Any) -> None:
+        """Say in the result which files were left out, else narrate it and let `finish` fail."""
+        from calib.core.result import Result
+
+        if not files.left_out:
+            return
+        whole = len(files.named)
+        # What a section holds does not depend on the folder.
+        said = [str(error).replace(f"{path.parent}/", "") for path, error in files.left_out.items()]
+        one = len(said) == 1
+        text = f"{len(said)} of {whole} logs cannot be used and {'is' if one else 'are'} left out: "
+        many = len(said) > _MANY * whole
+        finding = Finding(
+            "poor" if many else "remark",
+            text + "; ".join(said),
+            f"mend {'that log' if one else 'those logs'}, or record again" if many else "",
+        )
+        judged = [result for result in self.results(outcome) or [outcome] if isinstance(result, Result)]
+        for result in judged:
+            result.find(finding)
+        if not judged:
+            for path, error in files.left_out.items():
+                files.narrate(str(error))
+                files.failed[path] = error.exit_code
 
     def sections(self, outcome: Any) -> dict[str, Result]:
         """The sections of rig.yaml that an outcome holds, by name."""

@@ -82,6 +82,7 @@ class Job:
     status : the word of its verdict, or "failed"; "blocked" by one that failed; "skipped" where the folder
         has nothing for it; "" before the end.
     reason : one sentence for all but "ok". result : None where nothing was run; reused : by an earlier run.
+    instead : what is done where this fails.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Job:
     reason: str = ""
     result: Result | None = None
     reused: bool = False
+    instead: Job | None = None
 
     @property
     def label(self) -> str:
@@ -150,8 +152,10 @@ def _drift(folder: Folder, job: Job) -> Job:
 
 
 def _lowpass(folder: Folder, job: Job) -> Job:
-    logs = _logs(folder, "motion", *_CAMERA)[:1]
-    return replace(job, inputs=with_beside(logs), options={"log": logs[0]} if logs else {})
+    # The log is shown, and the first that can be used will do.
+    for log in reversed(_logs(folder, "motion", *_CAMERA)):
+        job = replace(job, inputs=with_beside([log]), options={"log": log}, instead=job)
+    return job
 
 
 def _nothing(_: Folder, job: Job) -> Job:
@@ -326,7 +330,11 @@ class Runner:
             else:
                 for task, code in self.processes.finished():
                     job, key = running.pop(task.name)
-                    self._end(self._stored(job, key, EXIT_INTERNAL if isinstance(code, Failure) else code))
+                    job = self._stored(job, key, EXIT_INTERNAL if isinstance(code, Failure) else code)
+                    if job.status == "failed" and job.instead is not None:
+                        waiting.insert(0, job.instead)
+                    else:
+                        self._end(job)
             self.progress(len(self.ended), len(jobs))
         return [self.ended[job.name] for job in jobs]
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.command import one_command
-from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, end_of
+from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, SomeFailedError, end_of
 from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
@@ -109,8 +109,11 @@ def perform(
         told.pop("seconds", None)
         write_atomically(folder / DOCUMENT, json.dumps(told, indent=1) + "\n")
         write_atomically(folder / WORDS, BLOCKS.dump_json(made.blocks(outcome)))
-        files.finish()
         code = EXIT_DONE if made.verdict(outcome).ok else EXIT_POOR
+        files.finish()
+    except SomeFailedError as error:
+        code = EXIT_POOR
+        messages.append(str(error))
     except Exception as error:
         code, sentence = end_of(error)
         if code == EXIT_INTERNAL and os.environ.get("CALIB_DEBUG") == "1":

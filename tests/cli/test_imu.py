@@ -67,6 +67,34 @@ def _at_rest(n: int = 3000) -> np.ndarray:
     return noise * np.random.default_rng(0).normal(size=(n, 6)) + [0.004, -0.003, 0.006, 9.8, 0.2, 0.1]
 
 
+def test_of_several_logs_one_that_cannot_be_used_is_left_out(
+    calib: Run, logs: list[Path], tmp_path: Path
+) -> None:
+    """It is named, and more than a fifth of the logs make the result poor."""
+    rig, spoilt, moved = tmp_path / "rig.yaml", tmp_path / "spoilt.csv", tmp_path / "moved.csv"
+    lines = logs[0].read_text().splitlines()
+    spoilt.write_text("\n".join([*lines[:300], "abc" + lines[300], *lines[301:]]) + "\n")
+    sound = [_write(tmp_path / f"rest{k}.csv", _at_rest()) for k in range(4)]
+    said = "1 of 5 logs cannot be used and is left out: spoilt.csv, line 301: t_s is 'abc"
+    ended = calib("imu", "static", sound[0], spoilt, *sound[1:], "--rig", rig)
+    assert ended.code == 0
+    assert f"(remark) {said}" in ended.out
+    section = Rig.load(rig).imu
+    assert section is not None
+    assert [log.name for log in section.logs] == [path.name for path in sound]
+    assert "spoilt.csv" not in section.inputs
+    assert str(tmp_path) not in rig.read_text()
+    # What is found as the log is worked on, too.
+    moved.write_text(HEAD + "".join(f"{k / 100},{k % 7},{k % 5},1,9,{k % 3},1\n" for k in range(2000)))
+    ended = calib("imu", "static", sound[0], moved, "--rig", rig)
+    assert ended.code == 1
+    assert "- 1 of 2 logs cannot be used and is left out: moved.csv: is never at rest" in ended.out
+    # A name that was mistyped, and where most cannot be used.
+    gone = tmp_path / "gone.csv"
+    assert "gone.csv: cannot be read" in calib("imu", "static", *sound, gone, "--rig", rig).sentence
+    assert "spoilt.csv, line 301" in calib("imu", "static", spoilt, moved, sound[0], "--rig", rig).sentence
+
+
 def test_section_table_and_kalibr(
     logs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

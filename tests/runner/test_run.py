@@ -13,6 +13,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from running_trials import CALLS, Inline, exit_code, make_folder, run_small
 
 from calib.core.errors import BadInputError
 from calib.core.rig import KINDS
+from calib.core.workers import Task
 from calib.runner.decision import read_summary
 from calib.runner.folder import read_folder
-from calib.runner.graph import HIDDEN, STEPS, Job, opened_run
+from calib.runner.graph import HIDDEN, STEPS, Job, Runner, opened_run
+from calib.runner.outputs import run_folder
 from calib.show.page import keep_pictures, page_text, write_page
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="killing is POSIX's")
@@ -93,6 +96,24 @@ def test_a_failure_stops_only_what_needs_it(tmp_path: Path) -> None:
     run_small(root, out)
     assert exit_code(out) == 0
     assert "lone" not in CALLS and "first" in CALLS
+
+
+def test_the_low_pass_is_shown_on_the_first_log_that_can_be_used(tmp_path: Path) -> None:
+    root, out = make_folder(tmp_path / "rig"), tmp_path / "out"
+    step = next(step for step in STEPS if step.name == "lowpass")
+
+    class Fails(Inline):
+        def start(self, task: Task) -> None:
+            self.codes = {"lowpass": 3 if task.arguments[4].get("log") == root / "logs" / "one.csv" else 0}
+            super().start(task)
+
+    with opened_run(out, root):
+        (job,) = run_folder(
+            Runner(read_folder(root), out, Fails(), steps=(replace(step, writes=()),)), page=False
+        ).ended
+    assert CALLS == ["lowpass", "lowpass"]
+    assert job.status == "ok"
+    assert job.inputs == (root / "logs" / "two.csv",)
 
 
 def test_a_poor_result_is_used_and_kept_poor(tmp_path: Path) -> None:

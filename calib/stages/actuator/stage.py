@@ -46,11 +46,11 @@ def _with_states(files: Files, options: PoseOptions) -> list[tuple[Path, Path | 
     states = expanded(options.states)
     if not states:
         return [(path, None) for path in files.paths]
-    if len(states) != len(files.paths):
-        raise UsageError(f"--states: {len(states)} files for {len(files.paths)} logs, expected one for each")
+    if len(states) != len(files.named):
+        raise UsageError(f"--states: {len(states)} files for {len(files.named)} logs, expected one for each")
     if options.truth:
         raise UsageError("--truth: takes the true columns, --states does not apply")
-    return list(zip(files.paths, states, strict=True))
+    return [pair for pair in zip(files.named, states, strict=True) if pair[0] in files.paths]
 
 
 @dataclass(frozen=True)
@@ -177,6 +177,7 @@ logs = Stage(
     LogsOptions,
     sources="Logs of camera and commands.",
     metavar="LOG...",
+    leaves_out=True,
     writes=("actuator", "pump"),
     uses=(
         "camera",
@@ -560,8 +561,8 @@ def _validate_words(outcome: Validated) -> list[Block]:
             text = "a simulated motion leaves the model before the log ends, its errors are not known"
             blocks.append(Line(text, "reason"))
         if one.replaced:
-            text = f"{one.replaced} rows stood away from their neighbours and were replaced by them"
-            blocks.append(Line(text, "reason"))
+            text = f"rows away from their neighbours, replaced by them: {one.replaced}"
+            blocks.append(Line(text, "remark"))
     return blocks
 
 
@@ -594,6 +595,7 @@ validate = Stage(
     ValidateOptions,
     sources="Logs to hold the models against.",
     metavar="LOG...",
+    leaves_out=True,
     uses=(*logs.uses, "arm"),
     document=_validate_document,
     words=_validate_words,

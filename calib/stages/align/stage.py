@@ -130,6 +130,7 @@ align = Stage(
     AlignOptions,
     sources="Logs of the rig in motion, static ones as well.",
     metavar="LOG...",
+    leaves_out=True,
     writes=("align",),
     needs=("camera", "plane"),
     uses=("geometry", "imu", "imu_intrinsics"),

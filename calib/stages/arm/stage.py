@@ -102,12 +102,13 @@ def read_trials(
         trial_of,
     )
 
-    names = [path.stem for path in files.paths]
+    names = [path.stem for path in files.named]
     if len(set(names)) < len(names):
         raise UsageError(f"logs: {', '.join(names)} are not all different, expected a name for each")
     loads = {n: parse_mass_kg(mass, "--load") for n, mass in _said(options.load or (), "--load", names)}
     days = {name: name.rpartition("_")[0] or name for name in names}
     days |= dict(_said(options.day or (), "--day", names))
+    used = {path.stem for path in files.paths}
     recordings, seen = [], dict[str, str]()
     for path in files.paths:
         recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
@@ -115,7 +116,7 @@ def read_trials(
         digest = files.hashes[name]
         if digest in seen:
             raise BadInputError(
-                f"{name}: is the same recording as {seen[digest]}, expected another trial; leave one out"
+                f"{seen[digest]} and {name}: are the same recording, expected different trials; leave one out"
             )
         seen[digest] = name
     if frame is None:
@@ -124,8 +125,8 @@ def read_trials(
         check_frame(recordings, frame)
         found = replace(frame, grows=planar_sign(recordings))
     trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
-    loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items()) or "none"
-    files.remarks.append(f"days: {', '.join(sorted(set(days.values())))}; loads: {loaded}")
+    loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items() if name in used) or "none"
+    files.remarks.append(f"days: {', '.join(sorted({days[name] for name in used}))}; loads: {loaded}")
     findings = [finding for one in recordings for finding in one.findings]
     return trials, found, (*findings, *frame_findings(found))
 
@@ -362,6 +363,7 @@ arm = Stage(
     Options,
     sources="Logs of commands, pressures and poses.",
     metavar="LOG...",
+    leaves_out=True,
     writes=("arm",),
     document=_document,
     words=_words,

@@ -56,7 +56,7 @@ def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
     if options.estimator != "fused" and (options.smooth or options.tune):
         raise UsageError(f"--estimator {options.estimator}: cannot be smoothed or tuned")
     outputs: list[Path | None] = [files.output] * len(files.paths)
-    if files.output is not None and len(files.paths) > 1:
+    if files.output is not None and len(files.named) > 1:
         check_folder(files.output)
         make_folder(files.output)
         outputs = _names(files.paths, files.output, options.states_format)
@@ -146,6 +146,7 @@ replay = Stage(
     ReplayOptions,
     sources="Logs of camera and IMU, or of motion capture in place of the camera.",
     metavar="LOG...",
+    leaves_out=True,
     output=Output(
         "States to write, .csv, .parquet or .mcap; with several logs a folder, made if needed.", None
     ),
