@@ -713,6 +713,8 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
     # A row that is written twice counts once.
     new = np.diff(t_s, prepend=-np.inf) > 0.0
     t_s, force, rates = t_s[new], force[new], rates[new]
+    if len(t_s) < 2:
+        return Turning(True, 0.0, 0.0, 0.0, dict.fromkeys(factors, 1.0), 0.0)
     phi = np.unwrap(np.arctan2(force[:, 1], force[:, 0]))
     z = -rates if rates.ndim == 1 else rates[:, 2]
     angle = np.concatenate([[0.0], np.cumsum(-z[1:] * np.diff(t_s))])

@@ -327,3 +327,13 @@ def test_parquet_has_units_too(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="give --acc-unit g"):
         read_log(path)
     assert np.allclose(read_log(path, LogOptions(acc_unit="g")).columns["ax_mps2"], values[:, 0])
+
+
+def test_stamps_that_never_advance_tell_no_unit_of_rates(tmp_path: Path) -> None:
+    """As those of an epoch in float32, which has steps of two minutes."""
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "t_s,gz_radps,ax_mps2,ay_mps2\n"
+        + "".join(f"1732784384,{0.01 * (k % 5):g},9.8,{k % 3}\n" for k in range(200))
+    )
+    assert len(read_log(path)) == 200
