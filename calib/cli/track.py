@@ -114,6 +114,7 @@ def track(
                         )
                     tracker = Tracker(learnt, start)
                 found.append(tracker.follow(frame))
+                tracker.take_back(found)
                 if start is not None and found[0] is None:
                     raise BadInputError(
                         f"{shown(source)}: no disc of its colour is at {at} of the first frame, expected the "
@@ -129,13 +130,15 @@ def track(
         raise BadInputError(f"{shown(source)}: {_why(tracker, start is not None)}")
     if disc is not None:
         disc.refuse_size([one for one in found if one is not None])
-    rows = track_rows(times.settled_s(), found, pixy, None if disc is None else disc.centre)
+    at_s = times.settled_s()
+    rows = track_rows(at_s, found, pixy, None if disc is None else disc.centre)
     write_atomically(output, f"{','.join(TRACK_COLUMNS)}\n{track_text(rows, pixy)}", TRACK)
     told: dict[str, Any] = {
         "frames": len(found),
         "found": seen,
         "lost": tracker.lost,
         "doubled": tracker.doubled,
+        "elsewhere_s": [float(at_s[k]) for k in tracker.elsewhere],
         "sigma_px": sorted(row[3] for row in rows)[len(rows) // 2],
         "times": times.words(),
     }
@@ -145,6 +148,8 @@ def track(
         say(f"marker in {seen} of {len(found)} frames, written to {shown(output)}; {tracker.lost} lost")
         if tracker.doubled:
             say(f"another disc of its colour in {tracker.doubled} frames")
+        if tracker.elsewhere:
+            say(tracker.doubt(at_s))
         say(f"sigma of the centre {told['sigma_px']:.2f} px")
         say(told["times"])
     if seen < _GATE * len(found):

@@ -112,7 +112,7 @@ class Marker:
         self._stream.write(_HEAD.encode())
         self._times, self._discs = Times(arrival=True, rate_hz=0.0), []
         self.tracker = Tracker(self.colour) if self.tracker is None else self.tracker
-        self.tracker.frames = self.tracker.lost = self.tracker.doubled = 0
+        self.tracker.begin()
 
     def _record(self, one: Disc | None, t_s: float) -> None:
         stamps = self._times.stamps_s
@@ -120,6 +120,8 @@ class Marker:
             return
         stamps.append(t_s)
         self._discs.append(one)
+        if self.tracker is not None:
+            self.tracker.take_back(self._discs)
         assert self._stream is not None and self.path is not None
         try:
             self._stream.write(track_text(track_rows([t_s - stamps[0]], [one])).encode())
@@ -154,7 +156,9 @@ class Marker:
             return
         seen = f"marker in {len(rows)} of {len(self._discs)} frames, written to {shown(self.path)}"
         sigma = float(np.median([row[3] for row in rows]))
-        self.last = f"{seen}; sigma of the centre {sigma:.2f} px; {self._times.words()}"
+        doubt = "" if self.tracker is None else self.tracker.doubt(self._times.settled_s())
+        told = (seen, doubt, f"sigma of the centre {sigma:.2f} px", self._times.words())
+        self.last = "; ".join(part for part in told if part)
 
     def shown(self) -> dict[str, Any]:
         """State for a page, as JSON takes it."""

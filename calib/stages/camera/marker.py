@@ -20,7 +20,7 @@ from __future__ import annotations
 import colorsys
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -73,11 +73,15 @@ _LEAST_COLOURED = 0.8
 """Share of the pixels inside that must have the marker's colour."""
 _AGAIN_FRAMES = 6
 """Frames without the marker after which the only disc of its colour and size is it, wherever that is."""
+_FORGOTTEN_FRAMES = 600
+"""Frames after which what was seen beside the marker, or before it came back elsewhere, is forgotten."""
+_BORDER_RADII = 3.0
+"""Distance from the border, in radii, within which a disc may just have come in."""
 _GROWTH, _GROWTH_PX, _GROWTH_LOST = 0.15, 1.0, 0.005
 """By how much a radius may change from one frame to the next, and more for each frame without the marker:
 half a disc looks like one of three quarters of its radius."""
 _JUMP_RADII = 4.0
-"""Radii within which the marker is taken for the same from one frame to the next, where there are two."""
+"""Radii from where it is expected within which a disc is the marker from one frame to the next."""
 
 
 @dataclass(frozen=True)
@@ -318,6 +322,12 @@ def _box(bgr: AnyArray, ellipse: _Ellipse, colour: Colour) -> tuple[int, int, in
     return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]), top + int(rows[-1])
 
 
+def _at_border(one: Disc, shape: tuple[int, ...]) -> bool:
+    reach = _BORDER_RADII * one.radius_px
+    (u, v), (height, width) = one.centre_px, shape[:2]
+    return bool(min(u, v, width - 1 - u, height - 1 - v) < reach)
+
+
 def disc_centre(
     ellipse_px: FloatArray,
     radius_m: float,
@@ -379,14 +389,55 @@ def scatter_px(centres_px: FloatArray, times_s: FloatArray) -> float:
 
 
 @dataclass
+class _Path:
+    """A disc over the frames: where it was last, its step from frame to frame, and the frames since then."""
+
+    disc: Disc
+    step_px: FloatArray = field(default_factory=lambda: np.zeros(2))
+    since: int = 0
+
+    def away(self, one: Disc) -> float:
+        """Distance of a disc from where this one is expected, in its radii."""
+        # A way that was not seen for long tells nothing.
+        expected = self.disc.centre_px + min(self.since, _AGAIN_FRAMES) * self.step_px
+        return float(np.hypot(*(one.centre_px - expected))) / self.disc.radius_px
+
+    @property
+    def reach(self) -> float:
+        """Radii from there within which this disc goes on by itself."""
+        speed = float(np.hypot(*self.step_px)) / self.disc.radius_px
+        return 1.0 + (0.1 + 0.5 * speed) * min(self.since, _AGAIN_FRAMES)
+
+    @property
+    def longest(self) -> float:
+        """Radii from there within which this disc may be."""
+        return _JUMP_RADII * min(1 + 0.5 * (self.since - 1), 6.0)
+
+    def alike(self, one: Disc) -> bool:
+        """Whether a disc may be this one by its size."""
+        growth = _GROWTH + _GROWTH_PX / self.disc.radius_px + _GROWTH_LOST * (self.since - 1)
+        return bool(abs(np.log(one.radius_px / self.disc.radius_px)) < min(growth, np.log(1.6)))
+
+    def to(self, one: Disc) -> None:
+        """Go on to a disc of this frame."""
+        step = (one.centre_px - self.disc.centre_px) / self.since
+        self.step_px = step if self.since == 1 else np.zeros(2)
+        self.disc, self.since = one, 0
+
+
+@dataclass
 class Tracker:
-    """Follows one disc.
+    """Follows one disc, and the others beside it, so that none of them is taken for it.
+
+    A disc far from where the marker was lost may be the marker or another one. It is followed; where a second
+    disc then shows that it may be another one, its frames are taken back.
 
     Attributes
     ----------
-    colour : of the marker; its saturation is learnt from what was found.
-    start_px : where it is in the first frame; None to take the only disc.
+    colour : of the marker. start_px : where it is in the first frame; None to take the only disc.
     frames, lost, doubled : frames in all, without the marker, and with another disc of its colour.
+    elsewhere : the frames from which on a disc far from where the marker was lost is followed.
+    taken_back : how many frames before the last one have lost their disc with it.
     """
 
     colour: Colour
@@ -394,56 +445,138 @@ class Tracker:
     frames: int = 0
     lost: int = 0
     doubled: int = 0
-    _last: Disc | None = None
-    _step_px: FloatArray = field(default_factory=lambda: np.zeros(2))
-    _since: int = 0
+    elsewhere: list[int] = field(default_factory=list)
+    taken_back: int = 0
+    _marker: _Path | None = None
+    _others: list[_Path] = field(default_factory=list)
+    _before: _Path | None = None
+    """The marker's path up to where it was lost, while a disc far from there is followed."""
+    _far: int = 0
+    _far_from: int = 0
+    """Frames that show that disc, and the first of them."""
 
     def follow(self, bgr: AnyArray) -> Disc | None:
         """The marker in the next frame; None where it is not seen, or not told apart from another."""
         self.frames += 1
-        self._since += 1
+        self.taken_back = 0
+        for path in (self._marker, self._before, *self._others):
+            if path is not None:
+                path.since += 1
+        self._others = [path for path in self._others if path.since < _FORGOTTEN_FRAMES]
         found = discs(bgr, self.colour)
         self.doubled += len(found) > 1
-        one = self._chosen(found)
+        if self._marker is None:
+            one = self._first(found)
+            self._marker = None if one is None else _Path(one)
+        else:
+            one = self._next(self._marker, found, bgr.shape)
         if one is None:
             self.lost += 1
-            return None
-        if self._last is not None:
-            step = (one.centre_px - self._last.centre_px) / self._since
-            self._step_px = step if self._since == 1 else np.zeros(2)
-        self._last, self._since = one, 0
+        elif self._before is not None:
+            self._far += 1
+            if self._far > _FORGOTTEN_FRAMES:
+                self._before = None
+        self._beside(found, one)
         return one
 
-    def _chosen(self, found: list[Disc]) -> Disc | None:
+    def take_back(self, found: list[Disc | None]) -> None:
+        """Empty the frames that were another disc's, in a list that ends with the last frame."""
+        end = len(found) - 1
+        found[max(end - self.taken_back, 0) : end] = [None] * min(self.taken_back, end)
+
+    def doubt(self, times_s: Sequence[float]) -> str:
+        """What to look at, by the times of the frames; empty where there is nothing."""
+        at = ", ".join(f"{times_s[frame]:.2f}" for frame in self.elsewhere[:5] if frame < len(times_s))
+        return f"lost and found far from there at {at} s: look whether it is the marker" if at else ""
+
+    def begin(self) -> None:
+        """Count from the next frame on."""
+        self.frames = self.lost = self.doubled = 0
+        self.elsewhere, self._before = [], None
+
+    def _first(self, found: list[Disc]) -> Disc | None:
         if not found:
             return None
-        if self._last is None:
-            if self.start_px is not None:
-                start = np.array(self.start_px)
-                near = min(found, key=lambda one: float(np.hypot(*(one.centre_px - start))))
-                return near if np.hypot(*(near.centre_px - start)) < 1.5 * near.radius_px else None
-            # Two of a kind cannot be told apart without a person's word.
-            return found[0] if len(found) == 1 else None
-        before = self._last
-        # A way that was not seen for long tells nothing.
-        expected = before.centre_px + min(self._since, _AGAIN_FRAMES) * self._step_px
+        if self.start_px is not None:
+            start = np.array(self.start_px)
+            near = min(found, key=lambda one: float(np.hypot(*(one.centre_px - start))))
+            return near if np.hypot(*(near.centre_px - start)) < 1.5 * near.radius_px else None
+        # Two of a kind cannot be told apart without a person's word.
+        return found[0] if len(found) == 1 else None
 
-        def away(one: Disc) -> float:
-            return float(np.hypot(*(one.centre_px - expected))) / before.radius_px
+    def _next(self, marker: _Path, found: list[Disc], shape: tuple[int, ...]) -> Disc | None:
+        free = [
+            one for one in found if marker.alike(one) and not self._another(marker, one, found, surely=True)
+        ]
+        if not free:
+            return None
+        near, *rest = sorted(free, key=marker.away)
+        if self._before is not None and (
+            any(self._appears_inside(one, shape) and not self._another(marker, one, found) for one in rest)
+            or (marker.away(near) > _JUMP_RADII and self._before.away(near) < marker.away(near))
+        ):
+            marker = self._marker = self._give_up(self._before)
+            near, *rest = sorted(free, key=marker.away)
+        away = marker.away(near)
+        lost = marker.since > _AGAIN_FRAMES
+        clearly = not rest or (marker.away(rest[0]) > 2 * away + 1.0 and not (lost and away > 1.0))
+        if not clearly or self._another(marker, near, found):
+            return None
+        # The only disc of which it is not known that it is another one is the marker, wherever it went.
+        alone = lost and len(found) == 1 + len(self._others)
+        if not alone and away > marker.longest:
+            return None
+        if away > _JUMP_RADII:
+            self.elsewhere.append(self.frames - 1)
+            if self._before is None:
+                self._before, self._far, self._far_from = replace(marker), 0, self.frames - 1
+        marker.to(near)
+        self._marker = marker
+        return near
 
-        growth = _GROWTH + _GROWTH_PX / before.radius_px + _GROWTH_LOST * (self._since - 1)
-        most = min(growth, float(np.log(1.6)))
-        alike = [one for one in found if abs(np.log(one.radius_px / before.radius_px)) < most]
-        ranked = sorted(alike, key=away)
-        if self._since > _AGAIN_FRAMES and len(found) == len(alike) == 1 and not self.doubled:
-            # Only one disc has ever been seen, wherever it went meanwhile.
-            return ranked[0]
-        reach = _JUMP_RADII * min(1 + 0.5 * (self._since - 1), 6.0)
-        if not ranked or away(ranked[0]) > reach:
-            return None
-        if len(ranked) > 1 and away(ranked[1]) < 2 * away(ranked[0]) + 1.0:
-            return None
-        return ranked[0]
+    def _another(self, marker: _Path, one: Disc, found: list[Disc], surely: bool = False) -> bool:
+        """Whether a disc may be one that was seen beside the marker, or surely is."""
+        away, in_touch = marker.away(one), marker.since <= 2
+        for path in self._others:
+            apart = path.away(one)
+            if not path.alike(one) or any(path.away(other) < min(apart, path.reach) for other in found):
+                continue
+            if surely:
+                if apart < path.reach and 2 * apart < away:
+                    return True
+            elif in_touch and path.since > _AGAIN_FRAMES and away < marker.reach:
+                continue
+            elif apart < (path.reach if in_touch else path.longest) and apart < 2 * away + 0.5:
+                return True
+        return False
+
+    def _appears_inside(self, one: Disc, shape: tuple[int, ...]) -> bool:
+        """Whether a disc cannot just have come in over the border, or the marker may have left by it."""
+        assert self._before is not None
+        return not _at_border(one, shape) or _at_border(self._before.disc, shape)
+
+    def _give_up(self, before: _Path) -> _Path:
+        """Give up the disc that is followed for the path before it."""
+        self.taken_back = self.frames - 1 - self._far_from
+        self.lost += self._far
+        self.elsewhere = [frame for frame in self.elsewhere if frame < self._far_from]
+        self._before, self._others = None, []
+        return before
+
+    def _beside(self, found: list[Disc], marker: Disc | None) -> None:
+        """Follow the discs that are surely not the marker."""
+        for one in found:
+            if one is marker or (
+                marker is None
+                and not (self._marker is not None and self._another(self._marker, one, found, surely=True))
+            ):
+                continue
+            near = [path for path in self._others if path.since and path.alike(one)]
+            path = min(near, key=lambda path: path.away(one), default=None)
+            if path is not None and path.away(one) < path.reach:
+                path.to(one)
+            else:
+                self._others.append(_Path(one))
 
 
 TRACK_COLUMNS = ("t_s", "u_px", "v_px", "sigma_px")
