@@ -11,6 +11,10 @@ line foretells the next one to a quarter of a period, and shorter where the cloc
 bursts, as from a buffer that is read now and then, the count goes by bursts, of which the last sample is the
 freshest.
 
+A clock with steps of about a period lets several samples bear one stamp, or leaves out every few steps. Where
+all stamps are whole steps apart, and stay within one of an even line, that is no lack of samples: they are
+spread over the step that they share, and counted with its width in mind.
+
 Wander w. Deviations of the stamps from the line are averaged over blocks of W samples. Jitter asks for long
 blocks and a clock that wanders, or a loop whose delays add up, for short ones; W is where the means of
 neighbouring blocks differ least (Allan's variance of two samples). Where single stamps are better than any
@@ -56,6 +60,10 @@ _WINDOW = 11
 _LOOKS = 7
 """Looks, at most, at whether gaps are in their places."""
 _LAG, _LONG_LAG = 8, 64
+COARSE = 0.3, 2.5
+_WHOLE, _ALMOST, _OTHERS, _WITHIN = 0.02, 0.85, 12, 1.3
+"""Steps of a clock, in periods, that are looked for; how far from whole ones stamps may be apart; steps that
+are nearly a period; how many unlike the usual one are enough to tell; by how many stamps leave a line."""
 _CLOSE, _BURSTS = 0.25, 0.25
 """Steps below this share of the mean one are within a burst; where so many steps are, bursts are the rule."""
 
@@ -189,6 +197,46 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
     return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()))
 
 
+def clock_step_s(stamps_s: FloatArray) -> float:
+    """Longest step of which all stamps (n,) [s] are whole ones apart, 0 for none; an even sensor's period."""
+    apart = np.diff(np.unique(stamps_s))
+    if len(apart) < _LEAST_SAMPLES:
+        return 0.0
+    least = float(np.median(apart[apart < 1.2 * apart.min()]))
+    near = apart[apart < 20.0 * least] / least
+    whole = (k for k in range(1, 5) if np.abs(k * near - np.rint(k * near)).max() < k * _WHOLE)
+    return least / next(whole, math.inf)
+
+
+def _coarse(t: FloatArray) -> tuple[float, float] | None:
+    """Step of the clock of a stretch and its samples' period, where these are about as long; else None."""
+    step = clock_step_s(t) if len(t) >= 2 * _LONG_LAG else 0.0
+    if step == 0.0:
+        return None
+    steps, apart = np.diff(t), t[_LONG_LAG:] - t[:-_LONG_LAG]
+    usual = apart[np.abs(apart - np.median(apart)) <= 1.5 * step]
+    period = float(usual.sum()) / max(len(usual), 1) / _LONG_LAG
+    if not COARSE[0] * period <= step <= COARSE[1] * period:
+        return None
+    # Such steps with a double one now and then are a sensor's of which every so many samples are missing.
+    if _ALMOST * period < step < period and steps.min() > 0.0:
+        return None
+    # Where samples are missing at random the stamps leave an even line, given some unusual steps to do so.
+    others = int((np.abs(steps - np.median(steps)) > 0.5 * step).sum())
+    size = max(_OTHERS * len(steps) // max(others, 1), _LONG_LAG)
+    whole = len(t) // size * size
+    off = (t[:whole] - period * np.arange(whole)).reshape(-1, size)
+    return (step, period) if whole and np.mean(np.ptp(off, axis=1) < _WITHIN * step) > 0.5 else None
+
+
+def _spread(t: FloatArray, step: float) -> FloatArray:
+    """Stamps of a clock with this step, those that are one spread over it."""
+    first = np.flatnonzero(np.diff(t, prepend=-math.inf) > 0.0)
+    count = np.diff(first, append=len(t))
+    rank = np.arange(len(t)) - np.repeat(first, count)
+    return np.asarray(t + step * ((rank + 0.5) / np.repeat(count, count) - 0.5))
+
+
 def _stretches(starts: IntArray, n: int) -> Iterator[tuple[int, int]]:
     """First sample of each stretch, and the one behind its last."""
     return pairwise([*starts.tolist(), n])
@@ -201,16 +249,21 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     if len(t) < _LEAST_SAMPLES or len(steps) < _LEAST_SAMPLES // 2:
         return None
     i, period = np.arange(len(t)), _rough_period(t, steps)
-    anchors = _anchors(t)
+    coarse = _coarse(t)
+    anchors = i if coarse is not None else _anchors(t)
     size = len(t) / len(anchors)
-    if size > 1.0:
+    if coarse is not None:
+        step, period = coarse
+        t, size = _spread(t, step), 2.0 + 2.0 * step / period
+    elif size > 1.0:
         # One burst may hold a sample more than the next.
         lag = min(_LAG, len(anchors) - 1)
         period = float(np.median((t[anchors[lag:]] - t[anchors[:-lag]]) / (anchors[lag:] - anchors[:-lag])))
-    k = _counted(t[anchors], i[anchors], period, _UNEVEN * size)
+    window = _WINDOW if coarse is None else 2 * _LONG_LAG + 1
+    k = _counted(t[anchors], i[anchors], period, _UNEVEN * size, window)
     if k is None:
         # A gap at the end of the first chunk is counted in the wrong place and bends its line.
-        k = _counted(t[anchors], i[anchors], period, _UNEVEN * size, held=True)
+        k = _counted(t[anchors], i[anchors], period, _UNEVEN * size, window, held=True)
     if k is None:
         return None
     origin, period, _ = _line(k, t[anchors])
@@ -263,17 +316,17 @@ def _anchors(t: FloatArray) -> IntArray:
     return lasts if close.mean() >= _BURSTS and len(lasts) >= _FIRST else everyone
 
 
-def _running_median(values: FloatArray) -> FloatArray:
-    if len(values) < _WINDOW:
+def _running_median(values: FloatArray, window: int = _WINDOW) -> FloatArray:
+    if len(values) < window:
         return values
-    half = _WINDOW // 2
+    half = window // 2
     padded = np.concatenate([values[:half][::-1], values, values[-half:][::-1]])
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, _WINDOW), axis=1))
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1))
 
 
-def _on_line(t: FloatArray, i: IntArray, origin: float, period: float) -> FloatArray:
+def _on_line(t: FloatArray, i: IntArray, origin: float, period: float, window: int) -> FloatArray:
     """Number k (n,) on the line of each of the samples i (n,), rising as they do or faster."""
-    behind = _running_median(np.rint((t - origin) / period) - i)
+    behind = np.rint(_running_median((t - origin) / period - i, window))
     if bool(np.all(behind[1:] >= behind[:-1])):
         return behind + i
     from scipy.optimize import isotonic_regression
@@ -301,26 +354,28 @@ def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
 
 
 def _counted(
-    t: FloatArray, i: IntArray, period: float, uneven: float, held: bool = False
+    t: FloatArray, i: IntArray, period: float, uneven: float, window: int, held: bool = False
 ) -> FloatArray | None:
-    """Numbers k (n,) of the samples i (n,); None where they are not steady.
+    """Numbers k (n,) of the samples i (n,), by `window` of them at a time; None where they are not steady.
 
     Each chunk is counted on from the line through those before it. Where the period is `held` it is still the
     given one after the first chunk.
     """
     k = np.zeros(len(t))
-    origin, nominal, done, chunk = float(t[0] - period * i[0]), period, 0, _FIRST
+    first = slice(0, window - _WINDOW + 1)
+    origin, nominal = float(np.median(t[first] - period * i[first])), period
+    done, chunk = 0, max(_FIRST, 2 * window - _FIRST)
     while done < len(t):
         end = min(done + chunk, len(t))
-        since = max(done - _WINDOW, 0)
-        counted = _on_line(t[since:end], i[since:end], origin, period)
+        since = max(done - window, 0)
+        counted = _on_line(t[since:end], i[since:end], origin, period, window)
         # Numbers that are known stay; those after them go on rising.
         k[done:end] = counted[done - since :]
         if done:
             k[done:end] += max(k[done - 1] + i[done] - i[done - 1] - k[done], 0.0)
-        last = slice(max(end - _WINDOW, done), end)
+        last = slice(max(end - window, done), end)
         off = t[last] - origin - period * k[last]
-        if chunk > _FIRST and abs(float(np.median(off))) > uneven * period:
+        if chunk > max(_FIRST, 2 * window - _FIRST) and abs(float(np.median(off))) > uneven * period:
             # The clock bends: it is looked less far ahead, from a line that reaches less far back.
             chunk //= 2
             recent = slice(max(done - 2 * chunk, 0), done)
@@ -335,7 +390,7 @@ def _counted(
         if not 0.5 * nominal < period < 2.0 * nominal or spread > uneven * period:
             return None
         # The last ones are looked at once more, with those that follow.
-        done, chunk = end if end == len(t) else end - _WINDOW, min(2 * chunk, _CHUNK)
+        done, chunk = end if end == len(t) else end - window, min(2 * chunk, max(_CHUNK, 3 * window))
     return k
 
 

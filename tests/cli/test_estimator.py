@@ -325,6 +325,15 @@ def test_one_sensor_alone_is_degraded(calib: Run, aligned: Path, log_file: Calla
     assert ended.code == 1 and "has no IMU" in ended.out
 
 
+def test_a_clock_that_several_readings_share_is_told(
+    calib: Run, aligned: Path, logs: dict[str, Log], tmp_path: Path
+) -> None:
+    stepped = _times(logs["ellipse"], lambda t: np.floor(t / 0.05) * 0.05)
+    ended = calib("replay", _put(tmp_path, "stepped", stepped), "--rig", aligned)
+    assert ended.code == 1
+    assert "- t_s comes in steps of 50 ms, each of which several readings share" in ended.out
+
+
 def test_logs_that_cannot_be_used_end_in_a_sentence(calib: Run, rig: Path, tmp_path: Path) -> None:
     for text, expected in (
         ("t_s\n0.0\n", "neither camera nor IMU"),

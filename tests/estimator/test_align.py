@@ -79,6 +79,29 @@ def test_swing_and_ellipse_align_a_rig() -> None:
         assert abs(np.nanmean(before)) > 5.0 * abs(np.nanmean(after))
 
 
+def test_the_clocks_steps_are_in_the_offset() -> None:
+    """A float32 after a day is averaged over; of a tick of the IMU's own period the phase is not known."""
+    trial = known(SimulatedRig())
+    logs = [align_log(twin_log(trial.rig, name, options, k)) for k, (name, options) in enumerate(MOTIONS[:2])]
+
+    def cut(step_s: float) -> Alignment:
+        def on(t: FloatArray) -> FloatArray:
+            return np.floor(t / step_s) * step_s
+
+        stepped = [replace(log, camera_s=on(log.camera_s), imu_s=on(log.imu_s)) for log in logs]
+        return align(stepped, prior_settings(trial.view))
+
+    fine, day, tick = (cut(step_s) for step_s in (1e-6, 1 / 128, 0.01))
+    assert fine.clock_s == 0.0
+    assert day.sigma[OFFSET] < 1.5 * fine.sigma[OFFSET]
+    assert np.abs(scores(trial, day)).max() < 4.0
+    assert tick.sigma[OFFSET] > 2e-3
+    assert abs(tick.sensor[OFFSET] - 0.025) < 3 * tick.sigma[OFFSET]
+    found = [one for one in judge(tick).findings if "the time offset" in one.text]
+    assert found[0].severity == "poor" and "clock has steps" in found[0].text
+    assert "microseconds" in found[0].advice
+
+
 def test_a_swing_between_readings_of_a_slow_imu_is_no_scale() -> None:
     """At 50 Hz a light head swings with eight readings a period."""
     nominal = SimulatedRig()

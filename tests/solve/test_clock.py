@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.core.arrays import BoolArray, FloatArray
-from calib.solve.clock import TimeAxis, time_axis
+from calib.solve.clock import TimeAxis, clock_step_s, time_axis
 
 
 def _held(axis: TimeAxis, stamps: FloatArray, jitter_s: float) -> None:
@@ -118,6 +118,32 @@ def _stamped(taken: FloatArray, jitter: float, repeated: float, seed: int) -> Fl
     for i in np.flatnonzero(rng.random(len(t)) < repeated):
         t[i] = t[max(i - 1, 0)]
     return t
+
+
+@pytest.mark.parametrize("step_s", [0.004, 1 / 128, 0.01, 1 / 64, 0.02])
+@pytest.mark.parametrize("period_s", [0.01, 1 / 60])
+def test_a_clock_of_coarse_steps_is_followed_through_them(step_s: float, period_s: float) -> None:
+    """Cut to its steps, of a sensor that jitters: all samples are late alike, by half a step."""
+    taken = 100.0 + period_s * np.arange(3000) + 4e-4 * np.random.default_rng(0).standard_normal(3000)
+    stamps = np.floor(taken / step_s) * step_s
+    axis = time_axis(stamps)
+    if 0.85 * period_s < step_s < period_s:
+        assert axis.missing
+        return
+    late = taken - axis.t_s
+    assert axis.steady and not axis.missing
+    assert axis.period_s == pytest.approx(period_s, rel=2e-5)
+    assert np.std(late) < 6e-4 < 0.2 * np.std(taken - stamps) + 4e-4
+    assert late.mean() == pytest.approx(0.5 * step_s, abs=0.1 * step_s)
+
+
+def test_the_step_of_a_clock() -> None:
+    rng = np.random.default_rng(0)
+    taken = np.cumsum(rng.uniform(0.005, 0.02, 500))
+    assert clock_step_s(taken) == 0.0
+    assert clock_step_s(np.round(taken, 2)) == pytest.approx(0.01)
+    assert clock_step_s((1e5 + taken).astype(np.float32).astype(float)) == 1 / 128
+    assert clock_step_s(1.7e9 + 0.01 * np.arange(500)) == pytest.approx(0.01, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -17,7 +17,7 @@ from calib.core.result import finite_or_none
 from calib.core.rig import Geometry
 from calib.core.verdict import Finding, Verdict
 from calib.core.words import all_of
-from calib.solve.clock import TimeAxis, time_axis
+from calib.solve.clock import COARSE, TimeAxis, clock_step_s, time_axis
 from calib.solve.delay import moments, shares, vertex
 from calib.solve.groups import tied_groups
 from calib.stages.align.section import LogCheck
@@ -963,6 +963,7 @@ class Alignment:
         gyroscope against the camera.
     correlation : (k,) of the camera's rate of angle with the gyroscope's at `OFFSETS_S`.
     left_out : sentences on gaps and logs that were not used.
+    clock_s : by how much steps of the logs' clocks may move the offset.
     """
 
     sensor: FloatArray
@@ -978,6 +979,7 @@ class Alignment:
     traces: tuple[Trace, ...]
     correlation: FloatArray
     left_out: tuple[str, ...]
+    clock_s: float = 0.0
 
     @property
     def sigma(self) -> FloatArray:
@@ -1009,6 +1011,29 @@ def rest_angle(sensor: FloatArray) -> tuple[float, FloatArray]:
     gradient[_SX], gradient[_SY] = by_x * GRAVITY_MPS2 * ca, by_y * GRAVITY_MPS2 * sa
     gradient[_MOUNT] = GRAVITY_MPS2 * (by_y * (1.0 + sensor[_SY]) * ca - by_x * (1.0 + sensor[_SX]) * sa)
     return math.atan2(y, x), gradient
+
+
+_LEAST_STEP_S, _OFF_GRID = 2e-3, 0.15
+"""A clock with finer steps moves the offset by less than half of what it is to be known to."""
+
+
+def clock_sigma_s(piece: Piece) -> float:
+    """Standard deviation [s] that steps of a log's clock give to the time offset, 0 for steps that do not.
+
+    Samples that come at every phase of the steps are late by the same on the average, and those that always
+    come at one phase by an unknown part of a step. Where no sensor is off the grid, that is how its times
+    were made up.
+    """
+    axes = piece.camera, piece.imu
+    step = clock_step_s(np.concatenate([axis.stamps_s for axis in axes]))
+    if step < _LEAST_STEP_S or max(axis.jitter_s for axis in axes) < _OFF_GRID * step:
+        return 0.0
+    phases = (np.exp(2j * np.pi * axis.t_s / step) for axis in axes)
+    locked = [
+        1.0 if step > COARSE[1] * axis.period_s else abs(phase.mean())
+        for axis, phase in zip(axes, phases, strict=True)
+    ]
+    return math.hypot(*locked) * step / math.sqrt(12.0)
 
 
 def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
@@ -1101,6 +1126,8 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)
     covariance = fit.covariance + _walked(settings, problem, fit)
+    clock_s = max(clock_sigma_s(piece) for piece in pieces)
+    covariance[_OFFSET, _OFFSET] += clock_s**2
     # Before: the sensors as they were assumed to be.
     before = mean.copy()
     before[_MOUNT] = 0.0
@@ -1110,7 +1137,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     )
     return Alignment(
         fit.sensor, covariance, mean, settings.sigma, fit.noise, fit.converged, fit.steps, first.moves,
-        first.factor, checks, traces, correlation(pieces), tuple(said),
+        first.factor, checks, traces, correlation(pieces), tuple(said), clock_s,
     )  # fmt: skip
 
 
@@ -1215,11 +1242,15 @@ def _known(found: Alignment) -> Iterator[Finding]:
         why = ""
         if turned < _TURNED_RAD:
             why = f": the logs hardly move (phi by {math.degrees(turned):.2g} degrees)"
+        advice = _SWING
+        if found.clock_s > 0.5 * offset:
+            why = f": the logs' clock has steps, which alone make {1e3 * found.clock_s:.2g} ms of it"
+            advice = "write t_s in microseconds, as each reading is taken"
         words = "is not observable, its deviation is" if offset > _OFFSET_S[1] else "has a deviation of"
         yield Finding(
             "unidentifiable" if offset > _OFFSET_S[1] else "poor",
             f"the time offset {words} {1e3 * offset:.2g} ms, expected 1 ms{why}",
-            _SWING,
+            advice,
         )
     if found.rest_angle_sigma > _REST_RAD:
         yield Finding(

@@ -34,6 +34,7 @@ from calib.core.verdict import Finding, Severity, Verdict
 from calib.io.columns import Passed
 from calib.io.logs import Log, Watch
 from calib.io.states import BASELINE, STATES, states_writer
+from calib.solve.clock import clock_step_s
 from calib.stages.estimator.baseline import Baseline
 from calib.stages.estimator.consistency import SENSORS, SETTLED_S, Tally
 from calib.stages.estimator.driven import (
@@ -625,6 +626,21 @@ def captured(first: Log, pose: bool) -> Iterator[Finding]:
         )
 
 
+_COARSE_S, _SHARED = 0.02, 1.5
+"""Steps of a clock from which on states are off by more than their sigma, and samples in a step."""
+
+
+def coarse(log: OpenLog) -> Iterator[Finding]:
+    """A finding where a clock's steps are so long that several readings of a sensor bear one stamp."""
+    step, periods = clock_step_s(log.first.t_s), (log.periods.camera_s, log.periods.imu_s)
+    if step > max(_COARSE_S, _SHARED * float(np.nanmin([*periods, math.inf]))):
+        yield Finding(
+            "poor",
+            f"t_s comes in steps of {1e3 * step:.3g} ms, each of which several readings share",
+            "write t_s in microseconds, as each reading is taken",
+        )
+
+
 _SEARCHED_ROWS = 2000
 _SHIFTS, _LATEST = (-4, -1, 1, 4), 50
 _TURNING_RADPS = 0.05
@@ -872,6 +888,7 @@ def _replayed(
         repeats = any((check.correlation or 0.0) > _REPEATING for check in checks.values())
         if repeats and all(one.severity != "inconsistent" for one in seen):
             findings += untimely(log.setup, rows_of(log.first, log.periods.ticks), place)
+        findings += coarse(log)
         findings += captured(log.first, log.periods.pose)
         still = log.periods.grid_px > 0.0 and sums.watch.still
         findings += consistent(checks, flags, max(tally.rows, 1), log.quiet, still)
