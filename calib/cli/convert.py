@@ -14,6 +14,7 @@ from calib.core.command import note_inputs
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.words import several
 from calib.core.writing import check_writable, write_atomically
 
 
@@ -47,6 +48,12 @@ def convert(
     first = next(stream, None)
     if first is None:
         raise BadInputError(f"{shown(log)}: has a header but no rows")
+    if not first.columns:
+        raise BadInputError(
+            f"{shown(log)}: has no column that is known beside its time, found "
+            f"{several(first.unknown) or 'none'}; say in columns.yaml what they are, such as "
+            "gz_radps: {column: NAME, unit: deg/s}"
+        )
     refuse_counts(first, tuple(first.columns))
     read_as = first.map
     if read_as is not None and read_as.narration:
@@ -86,4 +93,5 @@ def convert(
         many = f"{beyond.beyond} cells hold more than any sensor gives ({beyond.first})"
         narrate(f"{many}; they are written, and other verbs pass them over")
     if back:
-        narrate(f"{first_back}{f', as in {back - 1} more lines' * (back > 1)}; other verbs refuse that")
+        more = f", as in {back - 1} more lines" * (back > 1)
+        narrate(f"{first_back}{more}; other verbs refuse that, where it is not of sensors by turns")
