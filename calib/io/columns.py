@@ -234,6 +234,7 @@ class Passed:
     outside : pictures that put the marker outside of them.
     truncated : whether the last line was cut short and left out.
     wraps : how often the counter that is the time began again.
+    sorted : rows that stood below a later one, and were put where they belong.
     """
 
     not_finite: int = 0
@@ -244,6 +245,7 @@ class Passed:
     outside: int = 0
     clipped: int = 0
     end: str = ""
+    sorted: int = 0
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -255,6 +257,7 @@ class Passed:
             self.outside + later.outside,
             self.clipped + later.clipped,
             self.end or later.end,
+            self.sorted + later.sorted,
         )
 
     @property
@@ -271,6 +274,7 @@ class Passed:
             ),
             (self.truncated, "the last line is cut short and left out"),
             (self.wraps, f"the time is a counter that begins again {self.wraps} times, and is counted on"),
+            (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
         )
         return [sentence for there, sentence in kinds if there]
 

@@ -55,7 +55,7 @@ from calib.io.columns import (
     turning,
 )
 from calib.io.tables import GENERAL, TIME, open_text, parquet_blocks, table_bytes, text_blocks
-from calib.solve.clock import TimeAxis, time_axis
+from calib.solve.clock import SPLIT_S, TimeAxis, time_axis
 
 _MOST_CELLS = 200_000_000
 """Numbers that `read_log` takes, 1.6 GB; blocks of text have no such limit."""
@@ -419,9 +419,30 @@ def read_log(
         lines=np.concatenate([block.lines for block in blocks]),
         passed=sum((block.passed for block in blocks), ALL_TAKEN),
     )
+    log = in_order(log)
     if remarks is not None:
         remarks += log.remarks()
     return log
+
+
+def in_order(log: Log) -> Log:
+    """The log with rows sorted by time, where those of each writer are in order; else as it is.
+
+    Sensors that are read by threads of their own write rows with columns of their own, as they come.
+    """
+    late = log.t_s < np.maximum.accumulate(log.t_s)
+    if not late.any():
+        return log
+    blank = np.stack([np.isnan(column) for column in log.columns.values()], axis=1)
+    writer = np.unique(np.packbits(blank, axis=1), axis=0, return_inverse=True)[1].ravel()
+    by_writer = np.argsort(writer, kind="stable")
+    back = np.diff(log.t_s[by_writer]) < 0.0
+    if (back & (np.diff(writer[by_writer]) == 0)).any():
+        return log
+    rows = np.argsort(log.t_s, kind="stable")
+    columns = {name: column[rows] for name, column in log.columns.items()}
+    passed = log.passed + Passed(sorted=int(late.sum()))
+    return replace(log, t_s=log.t_s[rows], columns=columns, lines=log.lines[rows], passed=passed)
 
 
 def log_text(log: Log) -> str:
@@ -577,9 +598,15 @@ def check_time(log: Log) -> None:
     back = np.nonzero(np.diff(log.t_s) < 0.0)[0]
     if len(back):
         i = int(back[0]) + 1
+        anew = log.t_s[i - 1] - log.t_s[i] > SPLIT_S
+        advice = (
+            "the recorder has begun anew, or its clock was set: cut the log there"
+            if anew
+            else "sort its rows"
+        )
         raise BadInputError(
             f"{log.source}, line {log.lines[i]}: t_s goes back from {log.t_s[i - 1]:.6f} "
-            f"to {log.t_s[i]:.6f}, expected time to run forward"
+            f"to {log.t_s[i]:.6f}, expected time to run forward; {advice}"
         )
 
 

@@ -381,6 +381,24 @@ def test_a_time_that_begins_again_is_counted_on(
     assert "begins again" in log.remarks()[-1]
 
 
+def test_rows_of_writers_that_take_turns_are_sorted(write) -> None:
+    """Camera and IMU each in order, merged as threads come or one below the other; else rows stay."""
+    camera = [f"{0.02 * k + 0.001:.3f},{k},1,\n" for k in range(50)]
+    imu = [f"{0.01 * k:.2f},,,{k}\n" for k in range(100)]
+    turns = [row for k in range(50) for row in (*imu[2 * k : 2 * k + 2], camera[k])]
+    for rows in (turns, camera + imu):
+        log = read_log(write("t_s,u_px,v_px,p1_kpa\n" + "".join(rows)))
+        assert (np.diff(log.t_s) >= 0.0).all()
+        assert log.columns["p1_kpa"][log.sampled("p1_kpa")].tolist() == list(range(100))
+        assert log.columns["u_px"][log.sampled("u_px")].tolist() == list(range(50))
+        assert rows[log.lines[7] - 2].startswith(f"{log.t_s[7]:.3f}".rstrip("0"))
+        assert "below a later one, each sensor's own in order; sorted" in log.remarks()[-1]
+    again = read_log(write("t_s,u_px,v_px,p1_kpa\n" + "".join([*imu, *imu])))
+    with pytest.raises(BadInputError, match="line 102: t_s goes back"):
+        check_time(again)
+    assert again.passed.sorted == 0
+
+
 @pytest.mark.parametrize("falls_to", [0, 20_000])
 def test_a_board_that_was_started_again_is_no_counter(write, falls_to: int) -> None:
     counts = np.concatenate([30_000 + 10 * np.arange(100), falls_to + 10 * np.arange(100)])
