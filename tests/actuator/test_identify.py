@@ -641,6 +641,23 @@ def _changed(folder: Path, name: str, **columns: np.ndarray | None) -> Path:
     return path
 
 
+@pytest.mark.parametrize("least", [0, 70])
+def test_a_command_that_is_written_where_it_changes_holds(folder: Path, least: int) -> None:
+    """And where it hardly ever does: `least` makes one command of all below it."""
+    log = read_log(folder / "prbs.csv")
+    rows = log.sampled("pwm1", "pwm2")
+    pwm = np.stack([log.columns[name] for name in ("pwm1", "pwm2")], axis=1)
+    pwm[pwm < least] = least
+    every = _changed(folder, "prbs.csv", pwm1=pwm[:, 0].copy(), pwm2=pwm[:, 1].copy())
+    told = _read(folder, every.name)
+    assert (np.diff(pwm[rows], axis=0) == 0.0).all(axis=1).mean() > 0.5
+    pwm[rows[1:][(np.diff(pwm[rows], axis=0) == 0.0).all(axis=1)]] = np.nan
+    held = _read(folder, _changed(folder, "prbs.csv", pwm1=pwm[:, 0], pwm2=pwm[:, 1]).name)
+    assert held.tick_s == pytest.approx(1 / 60)
+    differ = np.any(told.pwm[: len(held.pwm)] != held.pwm[: len(told.pwm)], axis=1)
+    assert differ.mean() < 0.02
+
+
 def test_pictures_give_the_true_pose_with_the_noise_that_is_said(folder: Path) -> None:
     seen, true = _read(folder, "prbs.csv"), _read(folder, "prbs.csv", truth=True)
     assert (seen.source, true.source) == ("pictures", "truth")

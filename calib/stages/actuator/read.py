@@ -257,6 +257,8 @@ _HELD_S, _HELD_FEWEST = 0.25, 20
 _OF_SWING = 0.1
 _BEFORE_RELEASE_S = 0.03
 _MOST_TICKS = 10_000_000
+_LONGEST_TICK_S = 0.1
+"""No loop that drives a pump is slower."""
 _LATE_S = 0.01
 _TRUE_SIGMA = (1e-4, 1e-5)
 _LENGTH_SIGMA_M = 2e-4
@@ -368,6 +370,9 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
         )
     # A nominal rate that the stamps only scatter about is exact.
     tick_s = 1.0 / commands.axis.nominal_hz if len(t) > 2 else TICK_S
+    # Some loggers write a command where it changes; it holds until the next one.
+    if tick_s > _LONGEST_TICK_S or (len(t) > 2 and np.ptp(t) > 2.0 * (len(t) - 1) * np.median(np.diff(t))):
+        tick_s = TICK_S
     if not tick_s * _MOST_TICKS > end - float(t[0]):
         raise BadInputError(
             f"{log.source}: its commands are {tick_s:g} s apart, over {end - float(t[0]):g} s; "
