@@ -41,7 +41,7 @@ static inline uint16_t calib_link_crc(uint16_t check, uint8_t value) {
     uint8_t bit;
     check = (uint16_t)(check ^ (uint16_t)((uint16_t)value << 8));
     for (bit = 0; bit < 8; bit++) {
-        check = (uint16_t)((check & 0x8000u) ? (uint16_t)(check << 1) ^ 0x1021u : check << 1);
+        check = (uint16_t)(((unsigned)check << 1) ^ ((check & 0x8000u) ? 0x1021u : 0u));
     }
     return check;
 }

@@ -62,6 +62,19 @@ def _compiled(folder: Path, compiler: str, flags: str, text: str) -> subprocess.
     return subprocess.run(call, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.parametrize(("compiler", "flags"), COMPILERS[:2], ids=lambda v: v.replace(" ", ""))
+def test_the_frames_compile_as_c(tmp_path: Path, compiler: str, flags: str) -> None:
+    """Beside the Arduino core's Serial, whatever has one."""
+    write(tmp_path, header())
+    text = (
+        '#include "calib_constants.h"\n#include "calib_pipeline.h"\n'
+        "static struct { void (*write)(uint8_t); } Serial;\n"
+        '#include "calib_link.h"\n'
+    )
+    done = _compiled(tmp_path, compiler, flags, text)
+    assert done.returncode == 0, done.stderr
+
+
 def test_same_rig_same_bytes() -> None:
     again = header_of(copy.deepcopy(rig()), "elsewhere/rig.yaml")
     assert again.text == header().text
@@ -376,10 +389,9 @@ def test_the_delay_of_the_pictures_is_honoured_to_parts_of_a_tick(offset_s: floa
 
 
 def test_pictures_from_before_or_long_after_the_sample_are_refused() -> None:
-    for offset_s in (-0.02, 0.15):
-        with pytest.raises(
-            BadInputError, match=r"align\.time_offset_s is .* expected pictures that are -1 to 8"
-        ):
+    for offset_s, advice in ((-0.02, "by one clock"), (0.15, r"calib lowpass --rate 53Hz$")):
+        match = rf"align\.time_offset_s is .* expected pictures that are -1 to 8.*{advice}"
+        with pytest.raises(BadInputError, match=match):
             header_of(_with("align", time_offset_s=offset_s), "rig.yaml")
 
 

@@ -202,9 +202,15 @@ def _delay_ticks(lookup: Lookup, rate_hz: float) -> float:
     """Ticks from the exposure of a picture to the tick that reads it; 0 for pictures that seem early."""
     delay = lookup.number("align.time_offset_s", 0.0) * rate_hz
     if not -MOST_EARLY_TICKS <= delay <= MOST_DELAY_TICKS:
+        advice = (
+            "take a faster camera, or tick more slowly: calib lowpass --rate "
+            f"{max(math.floor(MOST_DELAY_TICKS * rate_hz / delay), 1)}Hz"
+            if delay > 0.0
+            else "record camera and IMU by one clock and align again: no picture comes before its motion"
+        )
         raise BadInputError(
             f"{lookup.source}: align.time_offset_s is {delay / rate_hz:g} s, {delay:.3g} ticks; "
-            f"expected pictures that are {-MOST_EARLY_TICKS:g} to {MOST_DELAY_TICKS} ticks late"
+            f"expected pictures that are {-MOST_EARLY_TICKS:g} to {MOST_DELAY_TICKS} ticks late; {advice}"
         )
     return max(delay, 0.0)
 
