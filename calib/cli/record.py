@@ -34,6 +34,11 @@ class _Port:
         except ModuleNotFoundError as error:
             raise UsageError(f"calib record needs pyserial: {pip_install('serial')}") from error
         self.name, self.now_s = shown(name), time.monotonic
+        if Path(name).is_file():
+            raise BadInputError(
+                f"{self.name}: is a file, expected a serial port such as /dev/ttyUSB0 or COM3; calib convert "
+                "reads bytes that were recorded"
+            )
         self._errors = (serial.SerialException, OSError)
         try:
             self.line = serial.Serial(name, baud, timeout=0.02, write_timeout=1.0)

@@ -288,6 +288,11 @@ def test_a_port_that_is_not_there(calib, tmp_path: Path) -> None:
     ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "log.csv")
     assert ended.code == 3
     assert "ttyNone: cannot be opened" in ended.sentence
+    port = tmp_path / "bytes.bin"
+    port.write_bytes(b"\xa5\x5a")
+    ended = calib("record", port, "-o", tmp_path / "log.csv")
+    assert ended.code == 3
+    assert "bytes.bin: is a file, expected a serial port such as /dev/ttyUSB0" in ended.sentence
 
 
 @pytest.mark.parametrize("words", [(), ("--do", "steps", "--yes")])
