@@ -14,6 +14,7 @@ from calib.cli.common import JsonOption, document, narrate, progress_bar, say, s
 from calib.core.errors import EXIT_POOR, UsageError
 from calib.core.files import shown
 from calib.core.units import parse_duration_s
+from calib.core.words import counted
 
 if TYPE_CHECKING:
     from calib.core.workers import Processes
@@ -177,7 +178,7 @@ _MOST_TOLD = 20
 
 def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
-    say(f"{summary.rigs} rigs: {words}" + (f"; {as_before} as before" if as_before else ""))
+    say(f"{counted(summary.rigs, 'rig')}: {words}" + (f"; {as_before} as before" if as_before else ""))
     rows = []
     for one in summary.constants:
         if one.standing_out or one.drifts:
@@ -241,7 +242,7 @@ def sweep(
 
 
 def _tell_sweep(summary: SweepSummary) -> None:
-    parts = [f"{summary.cases} cases"]
+    parts = [counted(summary.cases, "case")]
     if summary.as_before:
         parts.append(f"{summary.as_before} as before")
     if summary.failed:

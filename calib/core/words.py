@@ -295,6 +295,11 @@ def several(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + more
 
 
+def counted(count: int, one: str) -> str:
+    """A number of things, whose plural ends in s."""
+    return f"{count} {one}{'s' * (count != 1)}"
+
+
 def all_of(names: Sequence[str]) -> str:
     """Names for a sentence, as a, b and c."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -13,7 +13,7 @@ from calib.core import __version__
 from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
 from calib.core.units import unit_of
 from calib.core.verdict import POOR
-from calib.core.words import BLANK, SIGMA, as_words, number, several
+from calib.core.words import BLANK, SIGMA, as_words, counted, number, several
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
 from calib.runner.sweep import Point, Sweep, SweepSummary
@@ -30,7 +30,11 @@ def constant_figure(one: ConstantSummary) -> Figure:
     value = f"{name} ({one.unit})" if one.unit else name
     width = (one.high - one.low) / max(len(one.counts), 1)
     at = one.low + width * (np.arange(len(one.counts)) + 0.5)
-    outside = [f"{n} rigs lie {word}" for n, word in ((one.below, "below"), (one.above, "above")) if n]
+    outside = [
+        f"{counted(n, 'rig')} lie{'s' * (n == 1)} {word}"
+        for n, word in ((one.below, "below"), (one.above, "above"))
+        if n
+    ]
     panels = [
         Plot(
             value,
@@ -61,9 +65,9 @@ def constant_figure(one: ConstantSummary) -> Figure:
         word = (
             "It drifts with the serial number" if one.drifts else "It has no drift that is more than chance"
         )
-        sentence += f" {word}: {_with_sigma(drift)}{unit} per number, over {drift.count} rigs."
+        sentence += f" {word}: {_with_sigma(drift)}{unit} per number, over {counted(drift.count, 'rig')}."
         sentence += "" if near.all() else " Crosses are farther away than drawn."
-    return Figure(f"{name} over {one.spread.count} rigs", sentence, panels, 2.2 * len(panels))
+    return Figure(f"{name} over {counted(one.spread.count, 'rig')}", sentence, panels, 2.2 * len(panels))
 
 
 def _with_sigma(drift: Drift) -> str:
@@ -99,6 +103,7 @@ def fleet_page_text(summary: FleetSummary) -> str:
         bool(summary.constants),
         version=__version__,
         summary=summary,
+        rigs=counted(summary.rigs, "rig"),
         answer=answer,
         headline=headline,
         verdicts=[
@@ -119,7 +124,7 @@ def _answer(summary: FleetSummary) -> tuple[str, str]:
     drifting = [as_words(one.name) for one in summary.constants if one.drifts]
     parts = []
     if bad:
-        parts.append(f"{bad} of {summary.rigs} rigs ha{'ve' if bad > 1 else 's'} no result")
+        parts.append(f"{bad} of {counted(summary.rigs, 'rig')} ha{'ve' if bad > 1 else 's'} no result")
     if summary.verdicts.get("poor"):
         poor = summary.verdicts["poor"]
         parts.append(f"{poor} {'are' if poor > 1 else 'is'} poor")
@@ -129,7 +134,8 @@ def _answer(summary: FleetSummary) -> tuple[str, str]:
         drift = "drifts" if len(drifting) == 1 else "drift"
         parts.append(f"{several(drifting, 3)} {drift} with the serial number")
     if not parts:
-        return "yes", f"all {summary.rigs} rigs are ok, and none stands out"
+        one = summary.rigs == 1
+        return "yes", "the rig is ok" if one else f"all {summary.rigs} rigs are ok, and none stands out"
     return ("no" if bad else "not-yet"), "; ".join(parts)
 
 

@@ -420,6 +420,12 @@ def test_whole_harmless_and_told() -> None:
     assert fleet_page_text(found) == fleet_page_text(_summary(60))
 
 
+def test_a_fleet_of_one_rig() -> None:
+    text = fleet_page_text(_summary(1, 1))
+    assert "Fleet of 1 rig<" in text and "over 1 rig" in text
+    assert "1 rigs" not in text.replace(library(), "")
+
+
 def test_a_page_does_not_grow_with_the_fleet() -> None:
     few, many = (len(fleet_page_text(_summary(rigs, 2)).replace(library(), "")) for rigs in (300, 3000))
     assert many < 1.1 * few < 400_000
