@@ -325,6 +325,14 @@ def test_one_sensor_alone_is_degraded(calib: Run, aligned: Path, log_file: Calla
     assert ended.code == 1 and "has no IMU" in ended.out
 
 
+def test_a_rig_without_pumps_is_not_asked_for_its_bellows(
+    calib: Run, aligned: Path, logs: dict[str, Log], tmp_path: Path
+) -> None:
+    for pwm, asked in ((None, False), (logs["ellipse"].columns["pwm1"], True)):
+        log = _put(tmp_path, "log", logs["ellipse"], pwm1=pwm, pwm2=pwm)
+        assert ("the bellows' radius" in calib("replay", log, "--rig", aligned).out) == asked
+
+
 def test_a_clock_that_several_readings_share_is_told(
     calib: Run, aligned: Path, logs: dict[str, Log], tmp_path: Path
 ) -> None:

@@ -556,9 +556,7 @@ def consistent(
         if here and flags.get(flag, 0) > _FLAGGED_SHARE * rows:
             yield Finding("poor", f"{sentence} in {100.0 * flags[flag] / rows:.0f} % of the rows")
     if flags.get("time_jump"):
-        yield Finding(
-            "poor", f"the time jumps {flags['time_jump']} times; the filter starts again after each"
-        )
+        yield Finding("poor", f"jumps of the time: {flags['time_jump']}; the filter starts again after each")
     if flags.get("restarted"):
         text = f"the filter started again {flags['restarted']} times after rejecting all readings"
         yield Finding("remark", text)
@@ -765,7 +763,7 @@ def replay_log(
     kept: list[FloatArray] = []
     compared: dict[str, Errors] = {}
     sensor: FloatArray | None = None
-    findings = _unstated(rig)
+    findings = _unstated(rig) if has_commands(log.first) or rig.standing["actuator"] else []
     with _states_to(output, columns, kept.append if keep else None) as write:
         if estimator == "filterpy":
             stream = _watched(log.stream, sums.watch, _FILTERPY_ROWS, "--estimator filterpy")
