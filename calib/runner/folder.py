@@ -83,6 +83,7 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
 
     Raises `BadInputError` where there is no such folder, or nothing in it.
     """
+    from calib.io.columns import is_arm_log
     from calib.io.logs import columns_of
 
     if not root.is_dir():
@@ -116,6 +117,8 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     own = root / "rig.yaml"
     rig = own if own.is_file() and taken(own) else None
     left_out += _passed_over(root, flat)
+    if arms := [log.path for log in logs if is_arm_log(log.columns or ())]:
+        left_out.append(f"logs/: of a bending arm, which calib identify arm takes: {_names(arms)}")
     if not (pictures or plane or logs):
         raise BadInputError(
             f"{shown(root)}: holds no pictures in images/ and no logs in logs/, found "

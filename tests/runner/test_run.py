@@ -393,6 +393,14 @@ def test_links_out_of_the_folder_are_left_out_and_named(tmp_path: Path) -> None:
     assert [log.slug for log in followed.logs] == ["linked", "one", "two", "within"]
 
 
+def test_logs_of_a_bending_arm_are_told_their_verb(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    assert not read_folder(root).left_out
+    (root / "logs" / "arm_1.csv").write_text("t_s,p_cmd1_kpa,p1_kpa\n0,1,1\n")
+    (said,) = read_folder(root).left_out
+    assert said == "logs/: of a bending arm, which calib identify arm takes: arm_1.csv"
+
+
 def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
     root = make_folder(tmp_path / "rig")
     assert read_folder(root).left_out == ()
