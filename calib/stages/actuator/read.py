@@ -350,6 +350,8 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
             meant = (
                 "it has those of an arm: identify it by calib identify arm"
                 if is_arm_log(tuple(log.columns))
+                else "a pump's table is for calib identify pump"
+                if not log.columns
                 else "for a swing with the hoses off give --no-pwm"
             )
             raise BadInputError(f"{log.source}: has no commands, expected pwm1 and pwm2; {meant}")

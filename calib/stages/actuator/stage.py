@@ -12,7 +12,7 @@ from calib.core.files import shown
 from calib.core.options import PoseOptions, option
 from calib.core.stage import Files, Stage, later
 from calib.core.verdict import Verdict
-from calib.core.words import BLANK, Block, Line, Table
+from calib.core.words import BLANK, Block, Line, Table, number
 from calib.stages import expanded
 
 if TYPE_CHECKING:
@@ -269,7 +269,7 @@ def _pump_words(section: PumpSection) -> list[Block]:
         rows = []
         for one in MODELS[model]:
             sigma = fit.sigma.get(one.name)
-            value = "off" if sigma is None else _cell(fit.values[one.name], ".4g")
+            value = "off" if sigma is None else number(fit.values[one.name], sigma)
             rows.append((one.name, value, _cell(sigma, ".2g"), one.unit.replace("y", unit)))
         blocks.append(Table((model, "value", "sigma", "unit"), tuple(rows)))
     columns = (*models, *(f"{model}, 0.5 s ahead" for model in models))
