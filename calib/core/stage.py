@@ -147,11 +147,16 @@ class Files:
         return True
 
     def taken(self, path: Path) -> str:
-        """Note that a file is an input; its name without folders, the same wherever the folder lies."""
-        name = shown(path.name)
+        """Note that a file is an input; its name without folders, the same wherever the folder lies.
+
+        Raises `BadInputError` for a copy of one that is, which would count twice.
+        """
+        name, digest = shown(path.name), hash_of(path)
+        if first := next((other for other, one in self.hashes.items() if one == digest), ""):
+            raise BadInputError(f"{shown(path)}: is the same recording as {first}; leave one out")
         if name in self.hashes:
             name = f"{name} ({len(self.hashes) + 1})"
-        self.hashes[name] = hash_of(path)
+        self.hashes[name] = digest
         return name
 
 

@@ -810,7 +810,7 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     assert found.how == "truth" and found.hoses
     assert found.errors[IMPROVED]["q1"].rms < 1e-5 and found.errors[IMPROVED]["phi"].rms < 1e-3
     assert found.improvement_percent("q1") > 99.0
-    track, start = begun_track(files, log, known, PoseOptions())
+    track, start = begun_track(Files((log,), path), log, known, PoseOptions())
     seen = compare(track, models_of(known), start)
     assert seen.how == "pictures"
     # The marker's place comes in whole pixels of a third of a millimetre and more.

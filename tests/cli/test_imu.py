@@ -74,7 +74,7 @@ def test_of_several_logs_one_that_cannot_be_used_is_left_out(
     rig, spoilt, moved = tmp_path / "rig.yaml", tmp_path / "spoilt.csv", tmp_path / "moved.csv"
     lines = logs[0].read_text().splitlines()
     spoilt.write_text("\n".join([*lines[:300], "abc" + lines[300], *lines[301:]]) + "\n")
-    sound = [_write(tmp_path / f"rest{k}.csv", _at_rest()) for k in range(4)]
+    sound = [_write(tmp_path / f"rest{k}.csv", _at_rest() + 1e-4 * k) for k in range(4)]
     said = "1 of 5 logs cannot be used and is left out: spoilt.csv, line 301: t_s is 'abc"
     ended = calib("imu", "static", sound[0], spoilt, *sound[1:], "--rig", rig)
     assert ended.code == 0
@@ -84,6 +84,11 @@ def test_of_several_logs_one_that_cannot_be_used_is_left_out(
     assert [log.name for log in section.logs] == [path.name for path in sound]
     assert "spoilt.csv" not in section.inputs
     assert str(tmp_path) not in rig.read_text()
+    # A copy would count twice.
+    (tmp_path / "copy.csv").write_bytes(sound[0].read_bytes())
+    ended = calib("imu", "static", *sound, tmp_path / "copy.csv", "--rig", rig)
+    assert ended.code == 0
+    assert "is left out: copy.csv: is the same recording as rest0.csv" in ended.out
     # What is found as the log is worked on, too.
     moved.write_text(HEAD + "".join(f"{k / 100},{k % 7},{k % 5},1,9,{k % 3},1\n" for k in range(2000)))
     ended = calib("imu", "static", sound[0], moved, "--rig", rig)

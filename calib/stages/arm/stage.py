@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from calib.core.errors import BadInputError, UsageError
+from calib.core.errors import UsageError
 from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Progress, Stage
 from calib.core.verdict import Finding, Verdict
@@ -109,16 +109,10 @@ def read_trials(
     days = {name: name.rpartition("_")[0] or name for name in names}
     days |= dict(_said(options.day or (), "--day", names))
     used = {path.stem for path in files.paths}
-    recordings, seen = [], dict[str, str]()
+    recordings = []
     for path in files.paths:
         recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
-        name = files.taken(path)
-        digest = files.hashes[name]
-        if digest in seen:
-            raise BadInputError(
-                f"{seen[digest]} and {name}: are the same recording, expected different trials; leave one out"
-            )
-        seen[digest] = name
+        files.taken(path)
     if frame is None:
         found = frame_of(recordings)
     else:
