@@ -79,6 +79,19 @@ def test_swing_and_ellipse_align_a_rig() -> None:
         assert abs(np.nanmean(before)) > 5.0 * abs(np.nanmean(after))
 
 
+@pytest.mark.parametrize("pace", [0.0, 0.003, -0.01])
+def test_a_camera_on_a_faster_clock_is_told(pace: float) -> None:
+    """As of a video whose frames are counted by a nominal rate."""
+    trial = known(SimulatedRig())
+    logs = [align_log(twin_log(trial.rig, name, options, k)) for k, (name, options) in enumerate(MOTIONS[:2])]
+    logs = [replace(log, camera_s=log.camera_s + pace * (log.camera_s - log.camera_s[0])) for log in logs]
+    found = align(logs, prior_settings(trial.view))
+    assert abs(found.pace - pace) < 4 * found.pace_sigma < 4e-3
+    told = [one for one in judge(found).findings if "the camera's clock runs" in one.text]
+    assert [one.severity for one in told] == ["poor"] * (abs(pace) > 5 * found.pace_sigma)
+    assert abs(pace) < 0.01 or "% slower than the IMU's" in told[0].text
+
+
 def test_the_clocks_steps_are_in_the_offset() -> None:
     """A float32 after a day is averaged over; of a tick of the IMU's own period the phase is not known."""
     trial = known(SimulatedRig())

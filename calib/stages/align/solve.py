@@ -964,6 +964,8 @@ class Alignment:
     correlation : (k,) of the camera's rate of angle with the gyroscope's at `OFFSETS_S`.
     left_out : sentences on gaps and logs that were not used.
     clock_s : by how much steps of the logs' clocks may move the offset.
+    pace, pace_sigma : by which share the camera's clock is faster than the IMU's.
+    span_s : of the longest stretch.
     """
 
     sensor: FloatArray
@@ -980,6 +982,9 @@ class Alignment:
     correlation: FloatArray
     left_out: tuple[str, ...]
     clock_s: float = 0.0
+    pace: float = 0.0
+    pace_sigma: float = math.inf
+    span_s: float = 0.0
 
     @property
     def sigma(self) -> FloatArray:
@@ -1034,6 +1039,41 @@ def clock_sigma_s(piece: Piece) -> float:
         for axis, phase in zip(axes, phases, strict=True)
     ]
     return math.hypot(*locked) * step / math.sqrt(12.0)
+
+
+def _pace(pieces: Sequence[Piece], offset_s: float) -> tuple[float, float]:
+    """By which share the camera's clock is faster than the IMU's, and its deviation; inf where nothing tells.
+
+    With a delay d + a (t - t_0) the camera's angle is, to first order, theta - theta' (d + a (t - t_0)). Its
+    scale and offset and the gyroscope's bias are fitted beside d and a, stretch by stretch.
+    """
+    sums = np.zeros(2)
+    for piece in pieces:
+        use = np.flatnonzero(_use(piece, offset_s))
+        if len(use) < 2 * _LEAST_PICTURES:
+            continue
+        t, felt = piece.camera.t_s[use], piece.imu.t_s
+        rate = np.diff(piece.theta) / np.maximum(np.diff(felt), 1e-9)
+        theta = np.interp(t - offset_s, felt, piece.theta)
+        turning, since = -np.interp(t - offset_s, 0.5 * (felt[1:] + felt[:-1]), rate), t - t.mean()
+        A = np.stack([turning * since, turning, np.ones_like(t), since, theta], axis=1)
+        off = piece.phi[use] - theta
+        rest = off
+        for _ in range(3):
+            x = np.linalg.lstsq(A, off, rcond=None)[0]
+            rest = off - A @ x
+            near = np.abs(rest) <= 4.0 * robust_sigma(rest)
+            A, off, rest = A[near], off[near], rest[near]
+        if len(rest) < _LEAST_PICTURES or not rest.any():
+            continue
+        # What hangs together from picture to picture says less.
+        together = min(max(float(rest[1:] @ rest[:-1] / (rest @ rest)), 0.0), 0.99)
+        variance = float(rest @ rest) / max(len(rest) - A.shape[1], 1) * (1.0 + together) / (1.0 - together)
+        # A marker that stays on one pixel leaves nothing.
+        variance = max(variance, (0.1 * _PHI_SIGMA) ** 2)
+        known = 1.0 / max(float(np.linalg.pinv(A.T @ A)[0, 0]) * variance, 1e-12)
+        sums += known * x[0], known
+    return (float(sums[0] / sums[1]), float(sums[1] ** -0.5)) if sums[1] > 0.0 else (0.0, math.inf)
 
 
 def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
@@ -1138,6 +1178,8 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     return Alignment(
         fit.sensor, covariance, mean, settings.sigma, fit.noise, fit.converged, fit.steps, first.moves,
         first.factor, checks, traces, correlation(pieces), tuple(said), clock_s,
+        *_pace(pieces, float(fit.sensor[_OFFSET])),
+        max(float(np.ptp(piece.camera.t_s)) for piece in pieces),
     )  # fmt: skip
 
 
@@ -1153,6 +1195,8 @@ _REST_RAD = math.radians(0.1)
 _OUTLIERS = (0.2, 0.5)
 _FEW = 20
 _SHORT_S = 3.0
+_SURE_PACE, _PACE_S = 5.0, 4e-3
+"""Deviations, and change of the time offset within a log: four times what it is to be known to."""
 _JITTER_PX = 1.5
 _REPEATS = 0.25
 """On good logs of seven rigs, wrong plants and noise twice as large among them, .07 at most."""
@@ -1185,6 +1229,14 @@ def _data(found: Alignment) -> Iterator[Finding]:
                 f"not fit the IMU, expected {100.0 * _OUTLIERS[0]:.0f} % at most",
                 f"check the clock of {log.name}, or the offset that joined it, and what its marker is",
             )
+    if abs(found.pace) > _SURE_PACE * found.pace_sigma and abs(found.pace) * found.span_s > _PACE_S:
+        yield Finding(
+            "poor",
+            f"the camera's clock runs {1e2 * abs(found.pace):.2g} +- {1e2 * found.pace_sigma:.1g} % "
+            f"{'faster' if found.pace > 0.0 else 'slower'} than the IMU's; the time offset changes by "
+            f"{1e3 * abs(found.pace) * found.span_s:.0f} ms within a log",
+            "stamp both by one clock, and a video's frames by their own times",
+        )
     duration = sum(log.duration_s for log in found.logs)
     if duration < _SHORT_S:
         yield Finding(
