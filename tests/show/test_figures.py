@@ -31,7 +31,7 @@ from calib.stages.actuator.plots import pump_plots
 from calib.stages.actuator.section import SettledRuns
 from calib.stages.camera.bundle import Calibration, calibrate, covariance, rotation_exp
 from calib.stages.camera.checks import cell_means
-from calib.stages.camera.intrinsics import Intrinsics
+from calib.stages.camera.intrinsics import Candidate, Intrinsics
 from calib.stages.camera.lens import (
     PlaneView,
     analyse_distortion,
@@ -40,7 +40,7 @@ from calib.stages.camera.lens import (
 )
 from calib.stages.camera.model import Camera, View, pack, project
 from calib.stages.camera.plane import Plane, calibrate_plane
-from calib.stages.camera.plots import lens_plots, picture, plane_plots
+from calib.stages.camera.plots import _comparison, lens_plots, picture, plane_plots
 from calib.stages.camera.plots import plots as camera_plots
 from calib.stages.imu.intrinsics import IntrinsicsInputs, solve_intrinsics
 from calib.stages.imu.plots import intrinsics_plots, static_plots
@@ -479,3 +479,12 @@ def test_counts_have_ticks_at_whole_numbers_alone() -> None:
         bars = Bars(np.array([0.1, 0.2]), np.array([1.0, most]), 0.1)
         (panel,) = chart(Figure("t", "", (Plot("x", "views", (bars,), whole="y"),), 2.0))["panels"]
         assert panel["y"].get("dtick") == step and "dtick" not in panel["x"]
+
+
+def test_a_model_that_is_far_off_has_its_figure_in_its_row() -> None:
+    rms = {"pinhole": (0.19, 0.2), "radial2": (0.01, 0.0101), "radial3": (0.0099, 0.0102)}
+    found = [Candidate(name, 4, *pair, np.zeros(0), 3) for name, pair in rms.items()]
+    (panel,) = _comparison("lens model", found, "radial2").panels
+    assert panel.x_limits is not None
+    inside = [m for m in panel.marks if isinstance(m, Text) and m.x <= panel.x_limits[1]]
+    assert [(mark.y, mark.words.strip()) for mark in inside] == [(0, "from 0.19 px on")]

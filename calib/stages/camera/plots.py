@@ -389,6 +389,8 @@ def _comparison(what: str, candidates: Sequence[Candidate], chosen: str) -> Figu
         if taken:
             marks.append(Band("y", i - 0.45, i + 0.45, colour="ice"))
         marks.append(Curve(np.minimum(rms[i], limit), np.array([i, i]), colour="grey", size=2.0))
+        if rms[i].min() > limit:
+            marks.append(Text(limit, i, f"from {rms[i].min():.3g} px on  ", "grey", align="right"))
         for at, value in zip(columns, rms[i], strict=True):
             words = f"{value:.4f}" if math.isfinite(value) else "not fitted"
             marks.append(Text(float(at), i, words, bold=taken))
