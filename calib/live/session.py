@@ -33,6 +33,7 @@ from calib.stages.camera.corners import Detection, detect, find_size, reduced, r
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lattice import find_lattices, find_saddles
 from calib.stages.camera.model import Board, Camera, View, pack, project
+from calib.stages.camera.targets import other_board
 
 _LOOK_PX = 800
 """Largest side of what is searched while the camera runs; larger frames are made smaller for it."""
@@ -57,9 +58,11 @@ _BEFORE = 3
 _SMALL_SHARE = 0.15
 """Least diagonal of the board over that of the picture."""
 
-Code = Literal[
-    "no board", "part", "dark", "blurred", "alike", "small", "size", "move", "hold", "taken", "enough"
-]
+_UNSEEN_S = 2.0
+"""Without a board for so long, then for twice as long each time, another one is looked for: that takes up to
+a second."""
+
+Code = Literal["no board", "dark", "blurred", "alike", "small", "size", "move", "hold", "taken", "enough"]
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,9 @@ class Session:
     _plan: Plan | None = None
     _past: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=60))
     _waits: bool = False
+    _sized: tuple[int, int] | None = None
+    _asked: tuple[float, float] | None = None
+    _instead: str = ""
 
     # ------------------------------------------------------------------
     # Looking at a frame.
@@ -147,7 +153,10 @@ class Session:
         found = self.found(gray, size_px)
         if isinstance(found, Seen):
             self._past.clear()
+            if found.code == "no board" and (says := self._other(gray, t_s, still)):
+                return replace(found, says=says)
             return found
+        self._asked, self._instead = None, ""
         grid, fault = found
         hold = self._holds_still(grid, t_s)
         if fault is not None:
@@ -181,20 +190,46 @@ class Session:
         if self.size_px is not None and self.views and size_px != self.size_px:
             return Seen(None, "size", _other_size(size_px, self.size_px))
         self.size_px = size_px
-        n = 1
-        while max(gray.shape) / n > _LOOK_PX:
-            n += 1
-        level = resized(gray, 1.0 / n)
+        small = _reduced(gray)
+        board = None if self.corners is None else detect(small, *self.corners, quick=True)
+        # Until a picture is taken: a hand on the board makes it look smaller.
+        if board is None and not self._size_settled and (size := _size_of(small)):
+            self.corners = self._sized = size
+            board = detect(small, *size, quick=True)
         if self.corners is None:
-            self.corners = _size_of(level.image)
-            if self.corners is None:
-                return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
-        board = detect(level.image, *self.corners, quick=True)
+            return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
         if board is None:
             return Seen(None, "no board", self._sought())
-        scale = size_px[0] / level.image.shape[1]
+        scale = size_px[0] / small.shape[1]
         grid = (board.pixels.reshape(self.corners[1], self.corners[0], 2) + 0.5) * scale - 0.5
-        return grid, self._fault(level.image, board, scale)
+        return grid, self._fault(small, board, scale)
+
+    @property
+    def _size_settled(self) -> bool:
+        """Whether the board's size was stated, or a picture was taken."""
+        return self.corners is not None and (self.corners != self._sized or bool(self.views))
+
+    def _other(self, gray: GrayImage, t_s: float, still: bool) -> str:
+        """What else is held into the picture, looked for now and then; "" where nothing is known."""
+        since, wait = self._asked or (t_s, _UNSEEN_S)
+        self._asked = since, wait
+        if still or t_s - since >= wait:
+            self._asked = t_s, 2.0 * wait
+            self._instead = self._other_words(gray if still else _reduced(gray))
+        return self._instead
+
+    def _other_words(self, gray: GrayImage) -> str:
+        size = _size_of(gray) if self.corners else None
+        if size and self.corners and sorted(size) != sorted(self.corners):
+            return (
+                f"A board of {size[0]}x{size[1]} inner corners is seen, expected {self.corners[0]}x"
+                f"{self.corners[1]}: show all of that one, or begin a new folder, or give --corners."
+            )
+        other = None if size else other_board(gray)
+        if other is None:
+            return ""
+        more = ", or let calib intrinsics read pictures of it" if "ChArUco" in other else ""
+        return f"The picture shows {other}: show a checkerboard{more}."
 
     def _sought(self) -> str:
         assert self.corners is not None
@@ -244,9 +279,9 @@ class Session:
         if self.views and size_px != self._size():
             return Seen(None, "size", _other_size(size_px, self._size()))
         if self.corners is None:
-            self.corners = find_size(gray)
+            self.corners = self._sized = find_size(gray, within=True)
         if self.corners is None:
-            return Seen(None, "no board", "Not taken: no board is seen.")
+            return Seen(None, "no board", "Not taken: no board is seen whole.")
         self.size_px = size_px
         found = detect(gray, *self.corners)
         if found is None:
@@ -500,7 +535,15 @@ def edge_blur_px(gray: GrayImage, grid: FloatArray) -> float:
 def _size_of(gray: GrayImage) -> tuple[int, int] | None:
     """Inner corners of a board of unknown size, looked for only where there is some lattice."""
     some = find_lattices(find_saddles(reduced(gray, 120_000).image), least=9)
-    return find_size(gray) if some else None
+    return find_size(gray, within=True) if some else None
+
+
+def _reduced(gray: GrayImage) -> GrayImage:
+    """What is searched of a frame."""
+    n = 1
+    while max(gray.shape) / n > _LOOK_PX:
+        n += 1
+    return resized(gray, 1.0 / n).image
 
 
 def _other_size(size_px: tuple[int, int], expected_px: tuple[int, int]) -> str:

@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+from boards import charuco
 from chromium import browser_or_skip
 from liveboards import BOARD, CAMERA, Person, follow, random_poses, write_y4m
 from markervideos import Scene
@@ -136,6 +137,38 @@ def test_what_is_told_and_not_taken() -> None:
     assert isinstance(live.accept(person.frame(pose), "b.png", by_hand=True), View)
     other = live.look(cv2.resize(blank, (160, 120)), 0.0)
     assert other.code == "size" and "160x120" in other.says and "320x240" in other.says
+
+
+def test_a_board_that_comes_in_from_the_side_is_not_taken_for_a_smaller_one() -> None:
+    live, person = session(), Person(np.random.default_rng(3))
+    whole = person.frame(person.pose_at(live.ghost()))
+    grid = session().found(whole)[0]
+    square = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
+    for columns in (4, 3, 2):
+        # The border runs through the middle of a square.
+        out = int(np.sort(grid[..., 0].mean(axis=0))[columns] - 0.5 * square)
+        seen = live.look(np.ascontiguousarray(np.pad(whole[:, out:], ((0, 0), (0, out)), "edge")), 0.0)
+        assert (seen.code, live.corners) == ("no board", None), columns
+    # A hand on it makes it smaller as well, until all of it is shown.
+    hand = whole.copy()
+    hand[:, : int(np.sort(grid[..., 0].mean(axis=0))[1] + 0.3 * square)] = 120
+    live.look(hand, 0.0)
+    assert live.corners is not None and live.corners[0] < BOARD.columns
+    live.look(whole, 0.1)
+    assert live.corners == (BOARD.columns, BOARD.rows)
+
+
+def test_what_else_is_held_into_the_picture_is_named() -> None:
+    drawing = charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75).image
+    picture = cv2.resize(np.pad(drawing, 96, constant_values=255), (400, 320), interpolation=cv2.INTER_AREA)
+    live = Session()
+    assert [live.look(picture, t_s).says[:28] for t_s in (0.0, 1.0)] == ["Hold the whole board into th"] * 2
+    assert "shows a ChArUco board: show a checkerboard, or let calib intr" in live.look(picture, 3.0).says
+    person = Person(np.random.default_rng(0))
+    other = Session(corners=(9, 6), size_px=CAMERA.image_size_px)
+    whole = person.frame(person.pose_at(session().ghost()))
+    assert "whole board of 9x6 inner corners" in other.look(whole, 0.0).says
+    assert "A board of 8x5 inner corners is seen, expected 9x6: show" in other.look(whole, 3.0).says
 
 
 @pytest.mark.parametrize("size_px", [(640, 480), (480, 640), (720, 1280)])

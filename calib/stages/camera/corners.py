@@ -419,10 +419,10 @@ _SIZE_MISFIT = 0.04
 _LATTICES = 3
 
 
-def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
+def _whole(gray: GrayImage, points: FloatArray, within: bool) -> Refined | None:
     """Refine a grid and add the rows that follow it, until there are none; None when it is no board.
 
-    A pattern that leaves the picture on every side has no size.
+    A pattern that leaves the picture on every side has no size; `within` the picture, on any side.
     """
     for _ in range(_ROUNDS):
         if min(points.shape[:2]) < 3:
@@ -435,7 +435,7 @@ def _whole(gray: GrayImage, points: FloatArray) -> Refined | None:
         if not any(around.continues):
             sure = grid.refined.all() and grid.narrow.mean() < _NARROW
             sure &= grid.misfit_px < _SIZE_MISFIT * square_px(grid.points)
-            return grid if sure and any(around.seen) else None
+            return grid if sure and (all if within else any)(around.seen) else None
         wide = _ringed(grid.points)
         rows, columns = wide.shape[:2]
         points = wide[
@@ -449,21 +449,26 @@ def _size(grid: Refined) -> tuple[int, int]:
     return max(rows, columns), min(rows, columns)
 
 
-def find_size(gray: GrayImage) -> tuple[int, int] | None:
-    """Inner corners (columns, rows), columns >= rows, of the largest board of one picture."""
+def find_size(gray: GrayImage, within: bool = False) -> tuple[int, int] | None:
+    """Inner corners (columns, rows), columns >= rows, of the largest board of one picture.
+
+    Parameters
+    ----------
+    within : only of one that does not reach the picture's border, where it may be a part of a larger one.
+    """
     if not _shows_something(gray):
         return None
     for zoom in lattice_levels(gray):
         level = resized(gray, zoom)
         lattices = find_lattices(find_saddles(level.image), least=6)[:_LATTICES]
-        whole = [_whole(gray, level.to_picture(p)) for p in map(complete, lattices) if p is not None]
+        whole = [_whole(gray, level.to_picture(p), within) for p in map(complete, lattices) if p is not None]
         grids = [grid for grid in whole if grid is not None]
         if grids:
             return _size(max(grids, key=lambda grid: np.prod(np.ptp(grid.points, axis=(0, 1)))))
-    return _size_by_opencv(gray)
+    return _size_by_opencv(gray, within)
 
 
-def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
+def _size_by_opencv(gray: GrayImage, within: bool) -> tuple[int, int] | None:
     level = reduced(gray, _OPENCV_PIXELS)
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     try:
@@ -475,7 +480,9 @@ def _size_by_opencv(gray: GrayImage) -> tuple[int, int] | None:
     rows, columns = meta.shape[:2]
     if corners.size != 2 * rows * columns:
         return None
-    grid = _whole(gray, level.to_picture(np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)))
+    grid = _whole(
+        gray, level.to_picture(np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)), within
+    )
     return None if grid is None else _size(grid)
 
 

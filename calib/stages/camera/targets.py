@@ -536,6 +536,19 @@ def circle_grid(gray: GrayImage) -> tuple[str, int, int] | None:
     return None
 
 
+def other_board(gray: GrayImage) -> str | None:
+    """What a picture shows that is no checkerboard; None where that is nothing known."""
+    layout = recognise([gray])
+    if layout is not None:
+        return "a ChArUco board" if layout.kind == "charuco" else f"a grid of {layout.dictionary} markers"
+    grid = circle_grid(gray)
+    return None if grid is None else _circle_words(*grid)
+
+
+def _circle_words(kind: str, columns: int, rows: int) -> str:
+    return f"{'an' if kind == 'asymmetric' else 'a'} {kind} grid of circles, {columns}x{rows}"
+
+
 def name_of(pictures: Sequence[GrayImage]) -> str | None:
     """What most of these pictures show that calib does not read; None where that is nothing known."""
     counts = Counter(grid for gray in pictures if (grid := circle_grid(gray)))
@@ -545,4 +558,4 @@ def name_of(pictures: Sequence[GrayImage]) -> str | None:
     (kind, columns, rows), many = counts.most_common(1)[0]
     if many < max(1, len(pictures) // 3):
         return None
-    return f"{'an' if kind == 'asymmetric' else 'a'} {kind} grid of circles, {columns}x{rows}"
+    return _circle_words(kind, columns, rows)
