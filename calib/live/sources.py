@@ -126,7 +126,8 @@ class Watched:
             except OSError:
                 continue
             stamp = found.st_size, found.st_mtime_ns
-            if self._done.get(path.name) == stamp or self._now() - found.st_mtime <= _SETTLED_S:
+            # A clock that is ahead, as a phone's or a server's, says nothing of how long ago it was.
+            if self._done.get(path.name) == stamp or abs(self._now() - found.st_mtime) <= _SETTLED_S:
                 continue
             self._done[path.name] = stamp
             self.fault = ""

@@ -278,6 +278,13 @@ def test_rig_yaml_is_what_intrinsics_writes(tmp_path: Path, project_root: Path) 
         source_of(str(rig / "images"), rig / "images")
 
 
+def test_a_picture_whose_clock_is_ahead_is_looked_at(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((48, 64), 90, dtype=np.uint8))
+    written_s = (tmp_path / "a.png").stat().st_mtime
+    assert Watched(tmp_path, lambda: written_s + 0.1).read() is None
+    assert Watched(tmp_path, lambda: written_s - 3600.0).read() is not None
+
+
 @pytest.mark.slow
 def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
     person = Person(np.random.default_rng(0))
