@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
@@ -354,32 +354,40 @@ class Smoothed:
     lever_m: FloatArray
 
 
+class _Blocks(NamedTuple):
+    """Means over blocks: time, difference d, levers (n, 2), step and turn since the block before."""
+
+    t_s: FloatArray
+    d: FloatArray
+    X: FloatArray
+    dt: FloatArray
+    turn: FloatArray
+
+
+class _Densities(NamedTuple):
+    """q and q_b of the rate and its bias, r of v, and tau and size of c."""
+
+    q: float
+    q_b: float
+    r: float
+    tau: float
+    c: float
+
+
 @kernel()
-def _forward(
-    z: FloatArray,
-    X: FloatArray,
-    dt: FloatArray,
-    turn: FloatArray,
-    q: float,
-    q_b: float,
-    r: float,
-    tau: float,
-    c: float,
-    x: FloatArray,
-    P: FloatArray,
-    xs: FloatArray,
-    Ps: FloatArray,
-) -> float:
+def _forward(blocks: _Blocks, of: _Densities, P: FloatArray, xs: FloatArray, Ps: FloatArray) -> float:
     """Kalman filter over blocks; fills the states (n, 6) and covariances (n, 6, 6) where there is room.
 
     Returns the logarithm of the likelihood, without its constant.
     """
     m = 6
     keep = len(xs) > 0
-    x, P = x.copy(), P.copy()
+    dt, turn, X = blocks.dt, blocks.turn, blocks.X
+    x, P = np.zeros(m), P.copy()
+    P[5, 5] = of.c * of.c
     h, Ph = np.zeros(m), np.zeros(m)
     log_likelihood = 0.0
-    for k in range(len(z)):
+    for k in range(len(dt)):
         if k > 0:
             # P <- F P F' with F the identity but for its first row (1, dt, turn, 0, 0, 0) and its last.
             a, b = dt[k], turn[k]
@@ -388,17 +396,17 @@ def _forward(
                 P[0, j] += a * P[1, j] + b * P[2, j]
             for i in range(m):
                 P[i, 0] += a * P[i, 1] + b * P[i, 2]
-            P[0, 0] += q * dt[k]
-            P[1, 1] += q_b * dt[k]
-            kept = math.exp(-dt[k] / tau)
+            P[0, 0] += of.q * dt[k]
+            P[1, 1] += of.q_b * dt[k]
+            kept = math.exp(-dt[k] / of.tau)
             x[5] *= kept
             for j in range(m):
                 P[5, j] *= kept
             for i in range(m):
                 P[i, 5] *= kept
-            P[5, 5] += c * c * (1.0 - kept * kept)
+            P[5, 5] += of.c * of.c * (1.0 - kept * kept)
         h[3], h[4] = X[k, 0], X[k, 1]
-        s, e = r / dt[k], z[k]
+        s, e = of.r / dt[k], blocks.d[k]
         for i in range(m):
             Ph[i] = P[i, 0] + P[i, 3] * h[3] + P[i, 4] * h[4] + P[i, 5]
         s += Ph[0] + h[3] * Ph[3] + h[4] * Ph[4] + Ph[5]
@@ -419,22 +427,13 @@ def _forward(
     return log_likelihood
 
 
-def _backward(
-    dt: FloatArray,
-    turn: FloatArray,
-    q: float,
-    q_b: float,
-    tau: float,
-    c: float,
-    xs: FloatArray,
-    Ps: FloatArray,
-) -> float:
+def _backward(blocks: _Blocks, of: _Densities, xs: FloatArray, Ps: FloatArray) -> float:
     """Smooths the states in place; returns the mean variance of the first."""
-    steps = len(xs) - 1
+    steps, dt = len(xs) - 1, blocks.dt[1:]
     F, Q = np.tile(np.eye(_STATES), (steps, 1, 1)), np.zeros((steps, _STATES, _STATES))
-    kept = np.exp(-dt[1:] / tau)
-    F[:, 0, 1], F[:, 0, 2], F[:, 5, 5] = dt[1:], turn[1:], kept
-    Q[:, 0, 0], Q[:, 1, 1], Q[:, 5, 5] = q * dt[1:], q_b * dt[1:], c * c * (1.0 - kept * kept)
+    kept = np.exp(-dt / of.tau)
+    F[:, 0, 1], F[:, 0, 2], F[:, 5, 5] = dt, blocks.turn[1:], kept
+    Q[:, 0, 0], Q[:, 1, 1], Q[:, 5, 5] = of.q * dt, of.q_b * dt, of.c * of.c * (1.0 - kept * kept)
     ahead = F @ Ps[:-1]
     P_minus = ahead @ F.transpose(0, 2, 1) + Q
     G = np.linalg.solve(P_minus, ahead).transpose(0, 2, 1)
@@ -446,17 +445,6 @@ def _backward(
         P = Ps[k] + G[k] @ (P - P_minus[k]) @ G[k].T
         total += float(P[0, 0])
     return total / len(xs)
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """Means over blocks: time, difference d, levers (n, 2), step and turn since the block before."""
-
-    t_s: FloatArray
-    d: FloatArray
-    X: FloatArray
-    dt: FloatArray
-    turn: FloatArray
 
 
 def _means(values: FloatArray, starts: FloatArray, counts: FloatArray) -> FloatArray:
@@ -478,31 +466,20 @@ def _blocks(
 
 
 @kernel()
-def _likelihoods(
-    z: FloatArray,
-    X: FloatArray,
-    dt: FloatArray,
-    turn: FloatArray,
-    q_b: float,
-    P: FloatArray,
-    tried: FloatArray,
-) -> FloatArray:
+def _likelihoods(blocks: _Blocks, q_b: float, P: FloatArray, tried: FloatArray) -> FloatArray:
     """Logarithms of the likelihood of rows (n, 4) of q, r, tau, c."""
     out = np.empty(len(tried))
     for i in range(len(tried)):
         q, r, tau, c = tried[i]
-        P[5, 5] = c * c
-        out[i] = _forward(
-            z, X, dt, turn, q, q_b, r, tau, c, np.zeros(6), P, np.zeros((0, 6)), np.zeros((0, 6, 6))
-        )
+        of = _Densities(q, q_b, r, tau, c)
+        out[i] = _forward(blocks, of, P, np.zeros((0, 6)), np.zeros((0, 6, 6)))
     return out
 
 
 def _most_likely(blocks: _Blocks, q_b: float, P: FloatArray, tried: FloatArray) -> FloatArray:
     """Row (4,) of highest likelihood of `tried` (n, 4)."""
-    few = slice(0, _LIKELY_BLOCKS)
-    data = (blocks.d[few], blocks.X[few], blocks.dt[few], blocks.turn[few])
-    return np.asarray(tried[int(np.argmax(_likelihoods(*data, q_b, P.copy(), tried)))])
+    few = _Blocks(*(values[:_LIKELY_BLOCKS] for values in blocks))
+    return np.asarray(tried[int(np.argmax(_likelihoods(few, q_b, P, tried)))])
 
 
 def _likely(blocks: _Blocks, q_least: float, q_b: float, r_least: float, P: FloatArray) -> FloatArray:
@@ -549,15 +526,15 @@ def smooth_log(
     P = np.diag([1.0, _BIAS_SIGMA_RADPS**2, _SCALE_SIGMA**2, _LEVER_SIGMA_M**2, _LEVER_SIGMA_M**2, 0.0])
     coarse = _blocks(t, theta, rate_radps, phi_acc_rad, d, _COARSE_S)
     q, r, tau, c = _likely(coarse, gyro_noise**2, q_b, r_least, P).tolist()
-    P[5, 5] = c * c
     fine = _blocks(t, theta, rate_radps, phi_acc_rad, d, BLOCK_S)
     # What swings within half a second is noise that only the fine blocks show.
     noisier = np.array([(q, r * 4.0**k, tau, c) for k in range(_NOISIER)])
     r = float(_most_likely(fine, q_b, P, noisier)[1])
     xs, Ps = np.empty((len(fine.d), _STATES)), np.empty((len(fine.d), _STATES, _STATES))
-    _forward(fine.d, fine.X, fine.dt, fine.turn, q, q_b, r, tau, c, np.zeros(_STATES), P, xs, Ps)
+    of = _Densities(q, q_b, r, tau, c)
+    _forward(fine, of, P, xs, Ps)
     last, scale_sigma = xs[-1].copy(), math.sqrt(float(Ps[-1, 2, 2]))
-    variance = _backward(fine.dt, fine.turn, q, q_b, tau, c, xs, Ps)
+    variance = _backward(fine, of, xs, Ps)
     phi = theta + offset + np.interp(t, fine.t_s, xs[:, 0])
     # What lasts for tau counts at low frequencies with its size times the time that it lasts.
     slow = math.sqrt(r + 2.0 * c * c * tau)
