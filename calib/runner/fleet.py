@@ -884,7 +884,6 @@ class ConstantSummary:
     Attributes
     ----------
     counts : (bins,) of rigs from `low` to `high`; `below`, `above` : rigs outside of that.
-    limit : |z| beyond which a rig stands out, NaN where there are too few to tell.
     out : the rigs that do, as (name, value, z), the farthest first, no more than twenty.
     standing_out : how many do.
     drift : None where there are no serial numbers. drifts : whether it is more than chance.
@@ -899,7 +898,6 @@ class ConstantSummary:
     counts: tuple[int, ...]
     below: int
     above: int
-    limit: float
     standing_out: int
     out: tuple[tuple[str, float, float], ...]
     drift: Drift | None
@@ -955,7 +953,7 @@ def judged_names(names: tuple[str, ...]) -> list[str]:
 def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
     """The summary of a table, with the largest |z| (n,) of each rig and the constant that it is of."""
     names, serials, verdicts = (texts(table, name) for name in ("name", "serial", "verdict"))
-    numbers = np.array([_or_nan(serial_number(serial)) for serial in serials], dtype=np.float64)
+    numbers = np.array([serial_number(serial) for serial in serials], dtype=np.float64)
     wanted = judged_names(tuple(table.column_names))
     listed = [name for name in wanted if _varies(column(table, name))]
     rigs = len(names)
@@ -989,10 +987,6 @@ def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
     return summary, worst, which
 
 
-def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else value
-
-
 def _varies(values: FloatArray) -> bool:
     known = values[np.isfinite(values)]
     return len(known) > 0 and bool(known.max() > known.min() or len(known) == 1)
@@ -1024,7 +1018,6 @@ def _constant(
         counts,
         below,
         above,
-        limit if judged else float("nan"),
         len(standing),
         tuple((names[i], float(x[i]), float(z[i])) for i in first),
         drift,

@@ -776,7 +776,7 @@ class Fit:
     sensor, covariance : (14,) and (14, 14) of `SENSOR`.
     coefficients : of each stretch's spline. noise : that was found.
     good : for each stretch (n,), probability that a picture shows the marker.
-    loss, steps, converged : of Gauss-Newton.
+    steps, converged : of Gauss-Newton.
     """
 
     sensor: FloatArray
@@ -784,7 +784,6 @@ class Fit:
     coefficients: list[FloatArray]
     noise: Noise
     good: list[FloatArray]
-    loss: float
     steps: int
     converged: bool
     arrow: Arrow
@@ -873,7 +872,7 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
             loss = _loss(problem, cs, s, noise)
     covariance = np.asarray(cho_solve(arrow.S, np.eye(len(s))))
     covariance = 0.5 * (covariance + covariance.T)
-    return Fit(s, covariance, cs, noise, goods, loss, steps, converged, arrow)
+    return Fit(s, covariance, cs, noise, goods, steps, converged, arrow)
 
 
 def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArray:

@@ -341,7 +341,6 @@ class Smoothed:
     accel_noise : density of the accelerometer's angle at low frequencies, motion included [rad/sqrt(Hz)].
     bias_radps : of the rate, at the end of the log.
     scale, scale_sigma : of the rate, over the angle's.
-    lever_m : (2,) from the centre of rotation to the sensor, in its axes.
     """
 
     phi_rad: FloatArray
@@ -351,7 +350,6 @@ class Smoothed:
     bias_radps: float
     scale: float
     scale_sigma: float
-    lever_m: FloatArray
 
 
 class _Blocks(NamedTuple):
@@ -539,7 +537,7 @@ def smooth_log(
     # What lasts for tau counts at low frequencies with its size times the time that it lasts.
     slow = math.sqrt(r + 2.0 * c * c * tau)
     bias, scale = -float(last[1]), 1.0 - float(last[2])
-    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, bias, scale, scale_sigma, last[3:5])
+    return Smoothed(phi, math.sqrt(variance), math.sqrt(q), slow, bias, scale, scale_sigma)
 
 
 def damped(Kp: float, damping: float) -> Mahony:
