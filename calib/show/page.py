@@ -106,11 +106,6 @@ class Embedded:
     data: bytes
 
 
-def data_uri(jpeg: bytes) -> str:
-    """A picture as an address that needs no network."""
-    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}"
-
-
 def _key(name: str) -> str:
     return sha256(name.encode("utf-8", "surrogateescape"))[:24]
 
@@ -232,17 +227,7 @@ def page_text(rig: Path) -> str:
         views=views,
         unseen=unseen,
         views_json=_as_script(views),
-        constants=[
-            {
-                "section": c.section,
-                "name": c.name,
-                "text": number(c.value, c.sigma),
-                "unit": c.unit,
-                "sigma": c.sigma,
-                "share": c.share,
-            }
-            for c in constants(sections)
-        ],
+        constants=[(c, number(c.value, c.sigma)) for c in constants(sections)],
         inputs=[
             (section, name, digest)
             for section, files in (provenance.get("inputs") or {}).items()
@@ -286,8 +271,11 @@ def _views(hidden: Path, budget: _Budget) -> tuple[list[dict[str, Any]], int]:
     out = []
     for view in sorted(seen, key=lambda one: -(one.get("rms_px") or 0.0)):
         picture = kept_picture(str(view.get("view")), hidden / "pictures")
-        image = "" if picture is None else data_uri(picture.data)
-        if picture is None or not view.get("points_px") or not budget.takes(image):
+        if picture is None or not view.get("points_px"):
+            continue
+        # An address that needs no network.
+        image = f"data:image/jpeg;base64,{base64.b64encode(picture.data).decode('ascii')}"
+        if not budget.takes(image):
             continue
         out.append(
             {

@@ -265,9 +265,14 @@ def _in_units(recording: Recording) -> list[Finding]:
 
 def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterator[Finding]:
     """Steps of rotations (n, ...) [rad] and places (n, ...) [m] that no arm makes."""
+    from scipy.ndimage import median_filter
+
     step, moved = (np.linalg.norm(np.diff(one, axis=0), axis=1) for one in (turned, apart))
     # What moves fast does so for several samples.
-    step, moved = (np.where(one > _ALONE * _usual(one), one, 0.0) for one in (step, moved))
+    usual = (median_filter(np.nan_to_num(one), 5, mode="nearest") for one in (step, moved))
+    step, moved = (
+        np.where(one > _ALONE * by, one, 0.0) for one, by in zip((step, moved), usual, strict=True)
+    )
     length = float(np.nanmedian(np.linalg.norm(apart, axis=1))) if np.isfinite(apart).any() else math.inf
     for steps, least, scale, unit in (
         (step, _JUMP_RAD, math.degrees(1.0), "deg"), (moved, _JUMP_SHARE * length, 1e3, "mm")
@@ -280,12 +285,6 @@ def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterat
                 f"{scale * steps[far[0]]:.1f} {unit} from one sample to the next; {len(far)} such jumps "
                 "in all",
             )
-
-
-def _usual(steps: FloatArray) -> FloatArray:
-    """Median of each of the steps (n,) and two neighbours on either side."""
-    padded = np.pad(np.nan_to_num(steps), 2, mode="edge")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
 def frame_of(recordings: Sequence[Recording]) -> Frame:

@@ -35,11 +35,6 @@ def chi_square_band(degrees: int, draws: int, level: float = 0.95) -> tuple[floa
     return float(chdtri(total, 1.0 - tail)) / max(draws, 1), float(chdtri(total, tail)) / max(draws, 1)
 
 
-def correlation_band(count: int) -> float:
-    """95 % bound of the correlation of a white sequence with itself one step later."""
-    return 1.96 / math.sqrt(max(count, 1))
-
-
 def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m: float) -> FloatArray:
     """NEES (n,) of (q1, q2, phi), two degrees of freedom, of rows of `kinematic.OUT` against the truth.
 
@@ -159,5 +154,5 @@ class Tally:
             high=high,
             inside=float(sums[3] / count),
             correlation=finite_or_none(max(correlations, key=abs)),
-            correlation_bound=correlation_band(count),
+            correlation_bound=1.96 / math.sqrt(max(count, 1)),
         )
