@@ -12,9 +12,11 @@ import pytest
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture
+from calib.stages.camera import refine
 from calib.stages.camera.bundle import calibrate
 from calib.stages.camera.corners import Detection, detect, find_size
 from calib.stages.camera.model import Board, Camera, View, pack
+from calib.stages.camera.refine import frames_of
 from calib.twin.scene import PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 LENS = np.array([-0.22, 0.12, 0, 0, 0, 0, 0, 0.0])
@@ -209,6 +211,40 @@ def test_sharp_edges_are_placed_to_a_hundredth_of_a_pixel(
     assert rmse < max(0.012, 1.2 * sigma)
     assert rmse < 1.6 * sigma
     assert np.max(np.abs(errors)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("lit", "share"),
+    [
+        pytest.param(lambda u, v: 1.0, 0.75, id="even"),
+        pytest.param(lambda u, v: 0.4 + 0.6 * u, 0.75, id="from a side"),
+        pytest.param(lambda u, v: 1 / (1 + 5 * ((u - 0.2) ** 2 + (v - 0.3) ** 2)), 0.85, id="by a lamp"),
+        pytest.param(lambda u, v: 0.55 + 0.45 * (u + 0.6 * v > 0.8), 1.05, id="with a hard shadow"),
+        pytest.param(
+            lambda u, v: 0.8 + 0.15 * np.sin(2 * np.pi * u / 0.17) * np.cos(2 * np.pi * v / 0.2),
+            1.15,
+            id="with ripples of two squares",
+        ),
+    ],
+)
+def test_the_light_at_the_other_corners_places_a_blurred_one(
+    monkeypatch: pytest.MonkeyPatch, lit: Callable[[FloatArray, FloatArray], FloatArray], share: float
+) -> None:
+    """RMSE with the light's gradient from the corners beside, over that with one from its own window."""
+    height, width = PIXY.image_size_px[::-1]
+    v, u = np.mgrid[:height, :width] / np.array([height, width])[:, None, None]
+    shown = []
+    for seed in range(4):
+        gray, truth = _picture(PIXY, Board(9, 6, 0.025), seed, blur_px=2.5, gamma=1.0, noise_grey=0.0)
+        noise = np.random.default_rng(seed).normal(0.0, 2.0, gray.shape)
+        shown.append((np.clip(np.rint(gray * lit(u, v) + noise), 0, 255).astype(np.uint8), truth))
+
+    def rmse() -> float:
+        return float(np.sqrt(np.mean([_error(detect(gray, 9, 6), truth) ** 2 for gray, truth in shown])))
+
+    ours = rmse()
+    monkeypatch.setattr(refine, "frames_of", lambda points, tones=None: frames_of(points))
+    assert ours < share * rmse()
 
 
 @pytest.mark.parametrize("size", [(7, 5), (9, 6), (4, 4), (5, 4)])

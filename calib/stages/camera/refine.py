@@ -32,9 +32,10 @@ from calib.stages.camera.lattice import checkered, extrapolated
 # Light that is not even scales dark and bright alike, hence one gradient g. The parameters u0, v0,
 # alpha, beta, w, b, a, g_x, g_y, kappa, lambda of each corner are found by Levenberg-Marquardt. The
 # curvatures are measured much better by the row and column of corners than by a single window: that
-# value and its standard deviation enter as one more observation. So do the tones b and a of the start,
-# weakly: in a picture that is full everywhere nothing else holds them. The window is a parallelogram
-# along the board, so that the model holds in all of it.
+# value and its standard deviation enter as one more observation. So does the gradient, from the tones b
+# of the corners beside: where blur fills the window, g_y b y is nearly what a shift of u0 makes. So do
+# the tones b and a of the start, weakly: in a picture that is full everywhere nothing else holds them.
+# The window is a parallelogram along the board, so that the model holds in all of it.
 #
 # A camera that sharpens adds h times the difference between the picture and itself blurred by a Gaussian
 # of standard deviation r. Of the product of two edges that leaves
@@ -63,11 +64,12 @@ _SAMPLING_PX = 0.04
 """Standard deviation of the place of an edge along the pixels without blur, as in rendered pictures."""
 _PARAMETERS = 11
 _WIDTH = 4
-_OBSERVED = np.array([5, 6, 9, 10])
-"""Parameters that are observed beside the picture: b, a, kappa and lambda."""
+_OBSERVED = np.array([5, 6, 9, 10, 7, 8])
+"""Parameters that are observed beside the picture: b, a, kappa, lambda, g_x and g_y."""
 _TONE_SIGMA = 5.0
 """Standard deviation of the tones of the start, grey levels."""
 _UNKNOWN_BEND = 3e-3
+_UNKNOWN_LIGHT = 1.0
 _PART_PIXELS, _LEAST_PART = 24_000, 8
 """Corners are fitted in parts of about so many pixels, whose arrays stay in the processor's cache."""
 _EDGE_SLOPE = 2.0 / np.sqrt(np.pi)
@@ -92,12 +94,16 @@ class Frames(_Rows):
     along, across : (N, 2) steps to the next column and row, pixels.
     bends : (N, 2) curvatures of the edges along the row and along the column, 1 / px.
     bend_sigmas : (N, 2) standard deviations of `bends`.
+    light : (N, 2) gradient of the light over the light, 1 / px.
+    light_sigmas : (N, 2) its standard deviations.
     """
 
     along: FloatArray
     across: FloatArray
     bends: FloatArray
     bend_sigmas: FloatArray
+    light: FloatArray
+    light_sigmas: FloatArray
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,10 @@ class LocalFit(_Rows):
     window: FloatArray
     parameters: FloatArray
     converged: BoolArray
+
+    def tones(self, shape: tuple[int, int]) -> FloatArray:
+        """The mean of dark and bright at each corner of a grid, grey levels."""
+        return self.parameters[:, 5].reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -172,15 +182,56 @@ def _bends(curves: FloatArray) -> tuple[FloatArray, FloatArray]:
     return bend, sigma
 
 
-def frames_of(points: FloatArray) -> Frames:
-    """Steps and curvatures of a grid of corners, (rows, columns, 2) pixels, at least 2 x 2."""
+def _smoothed(values: FloatArray) -> FloatArray:
+    """Binomial means over 3 x 3 of a grid, without what alternates from corner to corner."""
+    for axis in (0, 1):
+        wide = np.pad(values, [(int(axis == k),) * 2 for k in (0, 1)], "reflect", reflect_type="odd")
+        before, after = np.delete(wide, (-1, -2), axis), np.delete(wide, (0, 1), axis)
+        values = 0.5 * values + 0.25 * (before + after)
+    return values
+
+
+def _slopes(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Steps along the rows of a grid (m, n), smoothed, and their standard deviations.
+
+    Half of how much a step changes to either side, or how far the smoothed one is from the corners' own.
+    """
+    smooth = _smoothed(values)
+    step = np.gradient(smooth, axis=1)
+    if values.shape[1] < 3:
+        return step, np.full_like(step, _UNKNOWN_LIGHT)
+    change = np.abs(np.diff(smooth, 2, axis=1))
+    # At the ends only one side tells.
+    change = np.concatenate([2.0 * change[:, :1], change, 2.0 * change[:, -1:]], axis=1)
+    off = np.maximum(0.5 * change, np.abs(np.gradient(values, axis=1) - step))
+    beside = np.pad(off, ((0, 0), (1, 1)))
+    largest = np.maximum(np.maximum(beside[:, :-2], beside[:, 2:]), off)
+    return step, np.maximum(largest, np.median(off, axis=1, keepdims=True))
+
+
+def frames_of(points: FloatArray, tones: FloatArray | None = None) -> Frames:
+    """Steps and curvatures of a grid of corners, (rows, columns, 2) pixels, at least 2 x 2.
+
+    The light's gradient follows from their tones (rows, columns), grey levels, and is unknown without.
+    """
     along, across = np.gradient(points, axis=1), np.gradient(points, axis=0)
     by_row, by_column = _bends(points), _bends(points.transpose(1, 0, 2))
     bends, sigmas = (
         np.stack([row.ravel(), column.T.ravel()], axis=1)
         for row, column in zip(by_row, by_column, strict=True)
     )
-    return Frames(along.reshape(-1, 2), across.reshape(-1, 2), bends, sigmas)
+    along, across = along.reshape(-1, 2), across.reshape(-1, 2)
+    light, light_sigmas = np.zeros_like(bends), np.full_like(bends, _UNKNOWN_LIGHT)
+    if tones is not None:
+        shades = np.log(np.nan_to_num(np.fmax(tones, 1.0)))
+        steps, changes = (
+            np.stack([row.ravel(), column.T.ravel()], axis=1)[..., None]
+            for row, column in zip(_slopes(shades), _slopes(shades.T), strict=True)
+        )
+        inverse = np.linalg.pinv(np.stack([along, across], axis=1))
+        light = (inverse @ steps)[..., 0]
+        light_sigmas = np.sqrt((inverse**2 @ changes**2)[..., 0])
+    return Frames(along, across, bends, sigmas, light, light_sigmas)
 
 
 def _windows(
@@ -367,9 +418,9 @@ def _fit_part(
     q = _start(points, frames, win, P)
     # Weight of the further observations, for residuals of the size that the fit will leave.
     noise = np.maximum(_NOISE * np.abs(q[:, 6, None]), _LEAST_NOISE)
-    sigmas = np.column_stack([np.full((N, 2), _TONE_SIGMA), frames.bend_sigmas])
+    sigmas = np.column_stack([np.full((N, 2), _TONE_SIGMA), frames.bend_sigmas, frames.light_sigmas])
     prior = (noise / np.maximum(sigmas, _LEAST_BEND_SIGMA)) ** 2
-    observed = np.column_stack([q[:, 5:7], frames.bends])
+    observed = np.column_stack([q[:, 5:7], frames.bends, frames.light])
     if warm is not None:
         kept = warm.residual < _WARM_RESIDUAL
         q[kept, 2:9] = warm.parameters[kept, 2:9]
@@ -904,7 +955,7 @@ def _closer_looked(part: Part, fit: LocalFit, grid: FloatArray) -> LocalFit:
     doubtful = np.flatnonzero((fit.residual > _DISTURBED * typical + 0.02) | ~fit.converged)
     if len(doubtful) == 0:
         return fit
-    frames = frames_of(grid).take(doubtful)
+    frames = frames_of(grid, fit.tones(part.shape)).take(doubtful)
     again = fit_corners(part, fit.points[doubtful], frames, window=_CLOSE_WINDOW)
     use = again.converged & (again.residual < np.where(fit.converged, 0.7 * fit.residual, np.inf)[doubtful])
     return _merged(fit, again, doubtful, use)
@@ -949,7 +1000,8 @@ def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction
         doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
         if len(doubtful) == 0:
             return fit, good, check.prediction
-        again = fit_corners(part, check.placed[doubtful], frames_of(check.grid).take(doubtful), window=window)
+        frames = frames_of(check.grid, fit.tones(part.shape)).take(doubtful)
+        again = fit_corners(part, check.placed[doubtful], frames, window=window)
         trial = _merged(fit, again, doubtful)
         near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
         use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
@@ -1056,9 +1108,8 @@ def refine(gray: GrayImage, points: FloatArray) -> Refined | None:
         moved = np.where(stays[..., None], moved, rough.points)
     fit, unsteady = first, np.arange(len(first.points))
     for _ in range(_PASSES):
-        again = fit_corners(
-            part, moved.reshape(-1, 2)[unsteady], frames_of(moved).take(unsteady), warm=fit.take(unsteady)
-        )
+        frames = frames_of(moved, fit.tones(shape)).take(unsteady)
+        again = fit_corners(part, moved.reshape(-1, 2)[unsteady], frames, warm=fit.take(unsteady))
         fit = again if len(unsteady) == len(fit.points) else _merged(fit, again, unsteady)
         before = moved
         moved = np.where(_sound(part, fit)[:, None], fit.points, before.reshape(-1, 2)).reshape(start.shape)

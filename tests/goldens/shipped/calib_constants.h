@@ -72,7 +72,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x476027CFUL
+#define CALIB_ID 0xF74F3D4BUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -82,13 +82,13 @@
 #define CALIB_IMAGE_WIDTH_PX 316 /* columns */
 #define CALIB_IMAGE_HEIGHT_PX 208 /* rows */
 #define CALIB_CAMERA_OK 1 /* 0: the calibration failed its gate */
-#define CALIB_CAMERA_FX_PX 273.40802f /* focal length along u, px; sigma_mu of (2.5) */
-#define CALIB_CAMERA_FY_PX 272.60257f /* focal length along v, px; sigma_nu of (2.5) */
+#define CALIB_CAMERA_FX_PX 273.425446f /* focal length along u, px; sigma_mu of (2.5) */
+#define CALIB_CAMERA_FY_PX 272.617584f /* focal length along v, px; sigma_nu of (2.5) */
 #define CALIB_CAMERA_SKEW_PX 0.0f /* skew, px; gamma of (2.5) */
-#define CALIB_CAMERA_CX_PX 160.670135f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
-#define CALIB_CAMERA_CY_PX 101.869415f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
-#define CALIB_CAMERA_K1 -0.219997272f /* lens, dimensionless, OpenCV's order and signs */
-#define CALIB_CAMERA_K2 0.549296975f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_CX_PX 160.668671f /* principal point, px from the centre of the left column; mu_0 of (2.5) */
+#define CALIB_CAMERA_CY_PX 101.862625f /* principal point, px from the centre of the top row; nu_0 of (2.5) */
+#define CALIB_CAMERA_K1 -0.220030725f /* lens, dimensionless, OpenCV's order and signs */
+#define CALIB_CAMERA_K2 0.549458385f /* lens, dimensionless, OpenCV's order and signs */
 
 /*
  * Inverse lens, normalised coordinates: yd = (v - cy) / fy, xd = (u - cx - skew yd) / fx, then
@@ -99,60 +99,60 @@
 #define CALIB_CAMERA_GREATEST_V_PX 207.5f /* greatest v inside the picture, px; the least is -0.5 */
 #define CALIB_CAMERA_HAS_LENS 1 /* 0: no distortion, default of CALIB_UNDISTORT */
 #define CALIB_CAMERA_HAS_SKEW 0 /* for #if */
-#define CALIB_CAMERA_PER_FX 0.00365753705f /* 1 / fx, 1/px */
-#define CALIB_CAMERA_PER_FY 0.00366834388f /* 1 / fy, 1/px */
+#define CALIB_CAMERA_PER_FX 0.00365730398f /* 1 / fx, 1/px */
+#define CALIB_CAMERA_PER_FY 0.00366814202f /* 1 / fy, 1/px */
 #define CALIB_LENS_INVERSE_ORDER 5 /* number of coefficients c */
 #define CALIB_LENS_DECENTERING_STEPS 0 /* 0: no decentering */
-#define CALIB_LENS_INVERSE_C1 0.217666402f /* coefficient of r2^1, dimensionless */
-#define CALIB_LENS_INVERSE_C2 -0.33372438f /* coefficient of r2^2, dimensionless */
-#define CALIB_LENS_INVERSE_C3 -1.56887734f /* coefficient of r2^3, dimensionless */
-#define CALIB_LENS_INVERSE_C4 3.43578029f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06336069f /* coefficient of r2^5, dimensionless */
+#define CALIB_LENS_INVERSE_C1 0.217699483f /* coefficient of r2^1, dimensionless */
+#define CALIB_LENS_INVERSE_C2 -0.333819926f /* coefficient of r2^2, dimensionless */
+#define CALIB_LENS_INVERSE_C3 -1.56958032f /* coefficient of r2^3, dimensionless */
+#define CALIB_LENS_INVERSE_C4 3.43781137f /* coefficient of r2^4, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06487942f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365901133f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.84286346e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599114299f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.92978244e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362183806f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160718814f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_31 -0.000315939047f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_32 -0.000872857461f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_33 3.7639873f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365878828f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.85111149e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599070489f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93312283e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.0036216795f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160719141f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_31 -0.000316923106f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_32 -0.000871971366f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_33 3.76387095f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 
 /*
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00040305f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241058748f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202286392f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216806624f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.98732245f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220976502f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_31 -0.0863802731f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_32 -0.237943202f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_33 3.62430787f /* row 3, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_LEAST_PER_M 0.356377214f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_NORMALISED_11 1.00040591f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241296869f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202337801f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.021691177f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987333477f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220940679f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_31 -0.0866548419f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_32 -0.237714723f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_33 3.62413001f /* row 3, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_LEAST_PER_M 0.356356561f /* 1/s below this: behind the horizon, 1/m */
 
 /*
  * The same from pixels as the camera reports them, fitted over the workspace, for
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369099551f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82034801e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604381502f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.21772885e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363201671f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160420105f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_31 -0.000436246803f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_32 -0.00111481769f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_33 3.81186843f /* row 3, distorted px to m */
-#define CALIB_PLANE_RAW_LEAST_PER_M 0.354962438f /* 1/s below this: behind the horizon, 1/m */
+#define CALIB_PLANE_RAW_11 0.00369077385f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82859968e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604337871f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.22105106e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.0036318535f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160419703f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_31 -0.000437254144f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_32 -0.00111405493f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_33 3.81176996f /* row 3, distorted px to m */
+#define CALIB_PLANE_RAW_LEAST_PER_M 0.354941338f /* 1/s below this: behind the horizon, 1/m */
 
 /* The tick: one picture, one sample of the IMU, one command. */
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
