@@ -431,7 +431,7 @@ def in_order(log: Log) -> Log:
     Sensors that are read by threads of their own write rows with columns of their own, as they come.
     """
     late = log.t_s < np.maximum.accumulate(log.t_s)
-    if not late.any():
+    if not late.any() or not log.columns:
         return log
     blank = np.stack([np.isnan(column) for column in log.columns.values()], axis=1)
     writer = np.unique(np.packbits(blank, axis=1), axis=0, return_inverse=True)[1].ravel()

@@ -62,7 +62,8 @@ def _log(data: bytes, path: Path) -> None:
             parts, refusal = read_log(path), ""
         except BadInputError as error:
             parts, refusal = None, str(error)
-        tables._BLOCK_BYTES = before
+        finally:
+            tables._BLOCK_BYTES = before
     if parts is None:
         # Only a line longer than two blocks may be refused where the whole is not.
         assert "does not end" in refusal, refusal
