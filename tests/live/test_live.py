@@ -171,6 +171,12 @@ def test_what_else_is_held_into_the_picture_is_named() -> None:
     assert "A board of 8x5 inner corners is seen, expected 9x6: show" in other.look(whole, 3.0).says
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4000), (4000, 1), (3, 4000)])
+def test_a_frame_of_a_few_pixels_shows_no_board(shape: tuple[int, int]) -> None:
+    for live in (Session(), Session(corners=(9, 6))):
+        assert live.look(np.full(shape, 128, dtype=np.uint8), 0.0).code == "no board"
+
+
 @pytest.mark.parametrize("size_px", [(640, 480), (480, 640), (720, 1280)])
 @pytest.mark.parametrize("corners", [(8, 5), (5, 8), (4, 3)])
 def test_the_first_outlines_are_in_the_picture(size_px: tuple[int, int], corners: tuple[int, int]) -> None:

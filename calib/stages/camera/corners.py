@@ -322,10 +322,11 @@ def resized(gray: GrayImage, zoom: float) -> Level:
     if zoom > 1.0:
         copy = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
         return Level(np.asarray(copy, dtype=np.uint8), zoom)
-    n = round(1.0 / zoom)
+    # A picture of a few rows keeps one.
+    n = min(round(1.0 / zoom), *gray.shape)
     height, width = gray.shape[0] // n, gray.shape[1] // n
     copy = cv2.resize(gray[: height * n, : width * n], (width, height), interpolation=cv2.INTER_AREA)
-    return Level(np.asarray(copy, dtype=np.uint8), zoom)
+    return Level(np.asarray(copy, dtype=np.uint8), 1.0 / n)
 
 
 def lattice_levels(gray: GrayImage) -> list[float]:
