@@ -539,12 +539,14 @@ class Tracker:
         away, in_touch = marker.away(one), marker.since <= 2
         for path in self._others:
             apart = path.away(one)
+            # A disc that is nearer to where it is expected is it.
             if not path.alike(one) or any(path.away(other) < min(apart, path.reach) for other in found):
                 continue
             if surely:
                 if apart < path.reach and 2 * apart < away:
                     return True
             elif in_touch and path.since > _AGAIN_FRAMES and away < marker.reach:
+                # It has been gone for long, and the marker goes on as expected.
                 continue
             elif apart < (path.reach if in_touch else path.longest) and apart < 2 * away + 0.5:
                 return True
