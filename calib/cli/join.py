@@ -49,7 +49,8 @@ def join(
     check_writable(output, LOG)
     known = Rig.load(rig, missing_ok=True)
     given = 0.0 if same_clock else offset
-    log, clocks, outside = joined(read_log(camera), read_log(board), known, shown(rig), given)
+    marker = read_log(camera, picture_px=known.picture_px)
+    log, clocks, outside = joined(marker, read_log(board), known, shown(rig), given)
     write_log(output, log)
     told: dict[str, Any] = {"log": shown(output), "rows": len(log), "outside": outside}
     lines = [f"{len(log)} rows written to {shown(output)}: t_s, {', '.join(log.columns)}"]

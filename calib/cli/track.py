@@ -66,8 +66,9 @@ def track(
     """Make a log of a coloured disc from a video or a camera: its centre below a pixel, and how sure that is.
 
     A frame in which the marker is not seen, or not told apart from another disc, has no row. Exits 1 when
-    fewer than 90 of 100 frames have one.
+    fewer than 90 of 100 frames have one, and when the rig's camera was calibrated at another size.
     """
+    from calib.core.rig import Rig
     from calib.io.frames import timed_frames
     from calib.stages.camera.marker import (
         TRACK,
@@ -88,6 +89,8 @@ def track(
     disc = None if diameter is None else _DiscOnPlane.of(rig, parse_length_m(diameter, "--diameter"))
     where = int(source) if source.isdecimal() else source if "://" in source else Path(source)
     check_writable(output, TRACK)
+    calibrated_px = Rig.load(rig, missing_ok=True).picture_px
+    size_px: tuple[int, int] | None = None
     times, frames = timed_frames(where)
     if times.arrival:
         refuse_recorded(output)
@@ -102,6 +105,7 @@ def track(
                     times.stamps_s.pop()
                     break
                 if tracker is None:
+                    size_px = frame.shape[1], frame.shape[0]
                     if disc is not None:
                         disc.refuse_frame(frame, source)
                     learnt: Colour | None = wanted
@@ -152,7 +156,10 @@ def track(
             say(tracker.doubt(at_s))
         say(f"sigma of the centre {told['sigma_px']:.2f} px")
         say(told["times"])
-    if seen < _GATE * len(found):
+    other_size = calibrated_px not in (None, size_px)
+    if other_size:
+        narrate(_other_size(source, size_px, rig, calibrated_px))
+    if other_size or seen < _GATE * len(found):
         raise typer.Exit(EXIT_POOR)
 
 
@@ -160,13 +167,25 @@ def _why(tracker: Tracker | None, stated: bool) -> str:
     if tracker is None:
         return "holds no frame that can be decoded"
     if tracker.doubled and not stated:
-        return (
-            f"{tracker.doubled} of {tracker.frames} frames show several discs of this colour; say with --at "
-            "where the marker is in the first frame"
-        )
+        several = f"{tracker.doubled} of {tracker.frames} frames show several discs of this colour"
+        if not tracker.first:
+            return f"{several} and the first shows none; begin the video with the marker in sight"
+        at = " and ".join("{:.0f},{:.0f}".format(*one.centre_px) for one in tracker.first[:_MOST_TOLD])
+        return f"{several}; say with --at where the marker is in the first frame, which has them at {at} px"
     return (
         f"no disc of hue {tracker.colour.hue_deg:.0f} degrees in any of {tracker.frames} frames; give its "
         "colour with --colour or --at"
+    )
+
+
+def _other_size(
+    source: str, size_px: tuple[int, int] | None, rig: Path, calibrated_px: tuple[int, int] | None
+) -> str:
+    assert size_px is not None and calibrated_px is not None
+    seen, known = (f"{width}x{height} px" for width, height in (size_px, calibrated_px))
+    return (
+        f"{shown(source)}: is {seen}, but the camera in {shown(rig)} was calibrated at {known}, and reads "
+        "these pixels wrongly; film the board as the marker was filmed, and calibrate on that video"
     )
 
 
@@ -226,5 +245,7 @@ class _DiscOnPlane:
         )
 
 
+_MOST_TOLD = 4
+"""Discs whose places are told."""
 _TIMES_SEEN, _SEEN_PX = 1.5, 2.0
 """A threshold of colour and a blur take or add a pixel or two of a disc's edge."""

@@ -297,6 +297,17 @@ def test_a_disc_of_another_size_is_refused(tmp_path: Path, diameter_m: float, fi
         disc.refuse_frame(np.zeros((480, 640, 3), dtype=np.uint8), "m.avi")
 
 
+def test_a_video_of_another_size_than_the_rig_s_camera_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    video = written(Scene(other="none"), tmp_path / "m.avi", 3)
+    assert ends(monkeypatch, video, "-o", "log.csv") == 0
+    rig_file(tmp_path / "rig.yaml")
+    assert ends(monkeypatch, video, "-o", "log.csv") == 1 and Path("log.csv").exists()
+    assert "is 640x480 px, but the camera in rig.yaml was calibrated at 316x208 px" in capsys.readouterr().err
+
+
 def test_what_the_command_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -305,7 +316,7 @@ def test_what_the_command_refuses(
     for code, words, sentence in (
         (3, ("m.avi", "--at", "5,5"), "there is no colour at 5,5 of the first frame"),
         (3, ("m.avi", "--at", "300,300", "--colour", "orange"), "no disc of its colour is at 300,300"),
-        (3, ("m.avi",), "show several discs of this colour; say with --at"),
+        (3, ("m.avi",), "the first frame, which has them at 493,250 and 120,70 px"),
         (3, ("m.avi", "--colour", "purple"), "no disc of hue 280 degrees in any of 6 frames"),
         (3, ("m.avi", "--diameter", "12mm"), "rig.yaml: has no camera yet, which --diameter needs"),
         (2, ("m.avi", "--diameter", "12mm", "--pixy"), "does not go with --pixy"),

@@ -16,6 +16,7 @@ import pytest
 from bags import readings, write_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from identifytrials import rig_file
 from sentframes import encoded
 
 from calib.core.files import hash_of
@@ -324,3 +325,7 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     ended = calib("join", "track.csv", "board.csv", "-o", "other.csv", cwd=tmp_path)
     assert ended.code == 3 and "do not tell one offset" in ended.err
     assert not (tmp_path / "other.csv").exists()
+    rig_file(tmp_path / "rig.yaml")
+    (tmp_path / "track.csv").write_text("t_s,u_px,v_px\n0.005,400,2\n0.02,401,4\n0.03,402,4\n")
+    ended = calib(*words, "outside.csv", cwd=tmp_path)
+    assert ended.code == 3 and "outside the picture of 316x208 px" in ended.err

@@ -436,6 +436,7 @@ class Tracker:
     ----------
     colour : of the marker. start_px : where it is in the first frame; None to take the only disc.
     frames, lost, doubled : frames in all, without the marker, and with another disc of its colour.
+    first : the discs of the first frame.
     elsewhere : the frames from which on a disc far from where the marker was lost is followed.
     taken_back : how many frames before the last one have lost their disc with it.
     """
@@ -445,6 +446,7 @@ class Tracker:
     frames: int = 0
     lost: int = 0
     doubled: int = 0
+    first: list[Disc] = field(default_factory=list)
     elsewhere: list[int] = field(default_factory=list)
     taken_back: int = 0
     _marker: _Path | None = None
@@ -465,6 +467,8 @@ class Tracker:
         self._others = [path for path in self._others if path.since < _FORGOTTEN_FRAMES]
         found = discs(bgr, self.colour)
         self.doubled += len(found) > 1
+        if self.frames == 1:
+            self.first = found
         if self._marker is None:
             one = self._first(found)
             self._marker = None if one is None else _Path(one)
