@@ -151,7 +151,8 @@ class Times:
     def settled_s(self) -> list[float]:
         """Times from the first frame on; counted where the stamps do not increase. Raises `BadInputError`."""
         if self.usable:
-            return [t - self.stamps_s[0] for t in self.stamps_s]
+            times = [t - self.stamps_s[0] for t in self.stamps_s]
+            return times if self.arrival else _unrounded_s(times)
         if not 1.0 <= self.rate_hz <= 1000.0:
             raise BadInputError("the video has no times that increase, and tells no rate of frames")
         return [k / self.rate_hz for k in range(len(self.stamps_s))]
@@ -170,6 +171,23 @@ class Times:
         if high - low < 0.01 * usual + 1.0:
             return f"times from the file, {span}: even, which says nothing of how even the camera was"
         return f"times from the file, {span}"
+
+
+_LEAST_STEP_MS, _ROUNDING_MS = 4.0, 0.6
+"""A step that a millisecond more or less leaves one step, and what rounding leaves about a fitted line."""
+
+
+def _unrounded_s(times_s: list[float]) -> list[float]:
+    """The even times of which these are the whole milliseconds, as in Matroska and WebM; else as they are."""
+    ms = 1e3 * np.array(times_s)
+    steps = np.diff(ms)
+    if len(steps) < 2 or np.abs(ms - np.rint(ms)).max() > 1e-3 or np.median(steps) < _LEAST_STEP_MS:
+        return times_s
+    k = np.r_[0.0, np.cumsum(np.rint(steps / np.median(steps)))]
+    step, first = np.polyfit(k, ms, 1)
+    if np.abs(first + step * k - ms).max() > _ROUNDING_MS:
+        return times_s
+    return list((1e-3 * step * k).tolist())
 
 
 def opened_video(source: int | str) -> cv2.VideoCapture | None:
@@ -199,18 +217,26 @@ def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[A
     times = Times(not isinstance(source, Path), float(video.get(cv2.CAP_PROP_FPS)))
 
     def frames() -> Iterator[np.ndarray[Any, Any]]:
+        black = True
         try:
             while True:
                 there, frame = video.read()
                 if not there or frame is None:
-                    return
+                    break
                 if frame.shape[0] * frame.shape[1] > _MOST_PIXELS:
                     raise BadInputError(f"{name}: frames have over {_MOST_PIXELS // 10**6} million pixels")
+                black = black and not frame.any()
                 stamp = time.monotonic() if times.arrival else 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 times.stamps_s.append(stamp)
                 yield frame
         finally:
             video.release()
+        if black and times.stamps_s and isinstance(source, Path):
+            # OpenCV converts no frames that are marked as interlaced, and hands out zeros.
+            raise BadInputError(
+                f"{name}: all of its {len(times.stamps_s)} frames come out black; where it is interlaced, as "
+                f"of a camcorder, write it anew: ffmpeg -i {shown(source.name)} -vf yadif progressive.mp4"
+            )
 
     return times, frames()
 

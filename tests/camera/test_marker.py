@@ -267,6 +267,17 @@ def test_what_times_are_worth() -> None:
     assert "later than the exposure" in Times(True, 30.0, [5.0, 5.02, 5.04]).words()
 
 
+@pytest.mark.parametrize("rate_hz", [25.0, 29.97, 30.0, 60.0, 120.0])
+def test_even_times_of_whole_milliseconds_are_even_again(rate_hz: float) -> None:
+    """WebM holds 0, 33, 67, 100 ms. Frames that are left out stay gaps; uneven ones stay as they are."""
+    k = np.delete(np.arange(200), [40, 41, 90])
+    told = Times(False, rate_hz, (0.1 + np.rint(1e3 * k / rate_hz) / 1e3).tolist())
+    assert np.abs(np.array(told.settled_s()) - k / rate_hz).max() < 2e-4
+    uneven = np.cumsum(np.random.default_rng(0).choice([33, 42, 50], 200)) / 1e3
+    settled = Times(False, 24.0, uneven.tolist()).settled_s()
+    assert settled == pytest.approx((uneven - uneven[0]).tolist(), abs=1e-12)
+
+
 def test_colours() -> None:
     assert parse_colour("Orange").hue_deg == parse_colour("24deg").hue_deg == 24
     assert parse_colour("#ff0000").hue_deg == 0 and parse_colour("#ff0000").saturation == 1
@@ -313,6 +324,11 @@ def test_what_the_command_refuses(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     video = written(Scene(other="disc"), tmp_path / "m.avi", 6)
+    # As frames come that are marked as interlaced.
+    black = cv2.VideoWriter("black.avi", cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 64))
+    for _ in range(3):
+        black.write(np.zeros((64, 64, 3), dtype=np.uint8))
+    black.release()
     for code, words, sentence in (
         (3, ("m.avi", "--at", "5,5"), "there is no colour at 5,5 of the first frame"),
         (3, ("m.avi", "--at", "300,300", "--colour", "orange"), "no disc of its colour is at 300,300"),
@@ -322,6 +338,7 @@ def test_what_the_command_refuses(
         (2, ("m.avi", "--diameter", "12mm", "--pixy"), "does not go with --pixy"),
         (2, ("m.avi", "--colour", "mauve-ish"), "is no colour"),
         (3, ("nothing.avi",), "nothing.avi: cannot be read"),
+        (3, ("black.avi",), "all of its 3 frames come out black; where it is interlaced"),
     ):
         assert ends(monkeypatch, *words, "-o", "log.csv") == code
         assert sentence in capsys.readouterr().err
