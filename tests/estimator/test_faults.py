@@ -141,6 +141,19 @@ def test_a_late_column_is_named(scenario: str, late: tuple[str, ...], samples: i
     assert told in finding.text
 
 
+def test_a_clock_that_steps_midway_is_named() -> None:
+    """The angle is off by 0.16 degrees, 7.6 of its deviations, after pictures that come 50 ms late."""
+    _, log = driven_log("ellipse")
+    imu = ("ax_mps2", "ay_mps2", "gz_radps")
+    later, middle = _delayed(log, imu, 5), len(log) // 2
+    columns = {**log.columns}
+    for name in imu:
+        columns[name] = np.concatenate([log.columns[name][:middle], later.columns[name][middle:]])
+    (finding,) = untimely(setup_for(varied_drive(0)), rows_from(replace(log, columns=columns)))
+    assert "the IMU comes" in finding.text
+    assert finding.text.startswith("from ")
+
+
 def test_delays_are_not_looked_for_in_a_log_at_rest() -> None:
     _, log = driven_log("static")
     late = _delayed(log, ("gz_radps",), 5)

@@ -16,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import chain, product
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import TypeVar
 
@@ -639,7 +639,8 @@ def coarse(log: OpenLog) -> Iterator[Finding]:
         )
 
 
-_SEARCHED_ROWS = 2000
+_SEARCHED_ROWS, _SEARCHED = 2000, 6
+"""Rows that are searched for a delay at once, and how many such stretches."""
 _SHIFTS, _LATEST = (-4, -1, 1, 4), 50
 _TURNING_RADPS = 0.05
 _REPEATING = 0.08
@@ -655,25 +656,43 @@ _TOGETHER = {
 """Columns that may be late as one, and how that is said. A delay of ax alone does states no harm."""
 
 
-def _moving(rows: Rows) -> Rows:
-    """The successive rows that are searched for delays: those that turn most."""
-    turned = np.cumsum(np.nan_to_num(rows.readings[:, 4]) ** 2)
-    spans = turned[_SEARCHED_ROWS:] - turned[:-_SEARCHED_ROWS]
-    first = int(np.argmax(spans)) if len(spans) else 0
-    return rows[first : first + _SEARCHED_ROWS]
+def _moving(setup: Setup, rows: Rows) -> list[Rows]:
+    """The stretches that are searched for delays: equal ones that turn, those that turn most first.
+
+    A clock that steps midway is right in the others.
+    """
+    ends = np.linspace(0, len(rows), math.ceil(len(rows) / _SEARCHED_ROWS) + 1).astype(int).tolist()
+    bias = setup.start.sensor[SENSOR.index("gyro_bias_radps")]
+    turning = {
+        (a, b): float(np.mean(np.nan_to_num(rows.readings[a:b, 4] - bias) ** 2)) for a, b in pairwise(ends)
+    }
+    moving = [
+        ab for ab in sorted(turning, key=turning.__getitem__, reverse=True) if turning[ab] > _TURNING_RADPS**2
+    ]
+    return [rows[a:b] for a, b in moving[:_SEARCHED]]
 
 
 def untimely(setup: Setup, rows: Rows, place: str = "pictures") -> Iterator[Finding]:
-    """A finding where other times of some column make a part of the log much likelier.
+    """A finding where other times of some column make a stretch of the log much likelier.
 
     Each of `_TOGETHER` is moved by some samples, and the kinematic filter runs again; a move that gains goes
     on while it does. One column's delay looks like the opposite one of the others: what gains nearly as much
     as the best is named beside it. A delay in a log at rest shows nothing.
     """
-    rows = _moving(rows)
-    turning = np.nan_to_num(rows.readings[:, 4] - setup.start.sensor[SENSOR.index("gyro_bias_radps")])
-    if not float(np.mean(turning**2)) > _TURNING_RADPS**2:
-        return
+    for stretch in _moving(setup, rows):
+        if late := _late(setup, stretch):
+            a, b = stretch.t_s[[0, -1]].tolist()
+            between = f"from {a:.1f} to {b:.1f} s " if len(stretch) < len(rows) else ""
+            yield Finding(
+                "inconsistent",
+                between + ", or ".join(late).replace("pictures", place),
+                "check how the log gets its times, or run calib align on logs of the same recorder",
+            )
+            return
+
+
+def _late(setup: Setup, rows: Rows) -> list[str]:
+    """Which columns come late in a stretch, in words, the likeliest first."""
     at = OUT.index("log_likelihood")
 
     @cache
@@ -698,21 +717,13 @@ def untimely(setup: Setup, rows: Rows, place: str = "pictures") -> Iterator[Find
             while abs(shift) < _LATEST and likelihood(names, shift + step) > likelihood(names, shift):
                 shift += step
             found[names] = max(found.get(names, (-math.inf, 0)), (likelihood(names, shift), shift))
-    if found:
-        period_ms = 1e3 * float(np.median(np.diff(rows.t_s[np.isfinite(rows.readings[:, 2:]).any(axis=1)])))
-        best = max(value for value, _ in found.values())
-        told = [
-            _TOGETHER[names]
-            .format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
-            .replace("pictures", place)
-            for names, (value, shift) in sorted(found.items(), key=lambda item: -item[1][0])
-            if value > best - _GAIN
-        ]
-        yield Finding(
-            "inconsistent",
-            ", or ".join(told),
-            "check how the log gets its times, or run calib align on logs of the same recorder",
-        )
+    period_ms = 1e3 * float(np.median(np.diff(rows.t_s[np.isfinite(rows.readings[:, 2:]).any(axis=1)])))
+    best = max((value for value, _ in found.values()), default=0.0)
+    return [
+        _TOGETHER[names].format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
+        for names, (value, shift) in sorted(found.items(), key=lambda item: -item[1][0])
+        if value > best - _GAIN
+    ]
 
 
 # ----------------------------------------------------------------------
