@@ -21,6 +21,7 @@ import colorsys
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -62,8 +63,11 @@ _ROUGH_SHARE = 0.06
 """Scatter of the edges over the radius above which a blob is no disc."""
 _LIGHT = (np.arange(256) / 255.0) ** 2.2
 """Light by grey level: mixtures are mixtures of light, and cameras store about its root."""
-_WAVES = np.exp(-1j * np.outer(_ANGLES, (3, 4)))
-"""The third and fourth wave around the outline: the first that an ellipse does not take up."""
+_ORDERS = np.arange(3, 13)
+_WAVES = np.exp(-1j * np.outer(_ANGLES, _ORDERS))
+"""Waves around the outline from the third on, the first that an ellipse does not take up."""
+_LONGEST, _SHORTEST, _SHORTEST_PX, _FEWEST_WAVES = 2, 3, 5.0, 5
+"""How many waves are the long ones and the short ones, the shortest in pixels, and the fewest in all."""
 _BENT_SHARE, _BENT_PX = 0.025, 0.25
 """Standard deviation of the centre, over the radius and in pixels, from which on what is seen is no disc,
 as with a hose before a fifth of it. Codecs mostly stay below."""
@@ -100,12 +104,14 @@ class Disc:
     ----------
     centre_px : (2,) centre of the ellipse. sigma_px : standard deviation of one coordinate, from the edges.
     axes_px : (2,) half axes. box_px : left, top, right, bottom of the coloured pixels, inclusive.
+    waves_px2 : (n,) squares of the outline's waves from the third on.
     """
 
     centre_px: FloatArray
     sigma_px: float
     axes_px: FloatArray
     box_px: tuple[int, int, int, int]
+    waves_px2: FloatArray = field(default_factory=lambda: np.zeros(len(_ORDERS)))
 
     @property
     def radius_px(self) -> float:
@@ -221,7 +227,9 @@ def measured(bgr: AnyArray, middle_px: FloatArray, radius_px: float, colour: Col
     if ellipse.sigma_px > max(_BENT_SHARE * radius, _BENT_PX):
         return None
     box = _box(bgr, ellipse, colour)
-    return None if box is None else Disc(centre, ellipse.sigma_px, ellipse.axes_px, box)
+    if box is None:
+        return None
+    return Disc(centre, ellipse.sigma_px, ellipse.axes_px, box, ellipse.waves_px2)
 
 
 def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray, BoolArray] | None:
@@ -266,6 +274,7 @@ class _Ellipse:
     scatter_px: float
     sigma_px: float
     share: float
+    waves_px2: FloatArray
 
 
 def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
@@ -302,9 +311,10 @@ def _ellipse(points: FloatArray, there: BoolArray) -> _Ellipse | None:
     alone = scatter * np.sqrt(2.0 / max(independent - 5.0, 1.0))
     # What covers a part, and a codec, bends the outline over many rays. The first wave of that moves the
     # centre, and is about as large as the next ones, which remain: of independent edges S is what `alone` is.
-    S = np.linalg.norm(np.where(used, left, 0.0) @ _WAVES) / used.sum()
+    waves = np.abs(np.where(used, left, 0.0) @ _WAVES / used.sum()) ** 2
+    S = np.sqrt(waves[:_LONGEST].sum())
     sigma = float(np.hypot(max(alone, S), _FLOOR_PX))
-    return _Ellipse(origin + scale * middle, axes, scatter, sigma, float(used.mean()))
+    return _Ellipse(origin + scale * middle, axes, scatter, sigma, float(used.mean()), waves)
 
 
 def _box(bgr: AnyArray, ellipse: _Ellipse, colour: Colour) -> tuple[int, int, int, int] | None:
@@ -354,38 +364,89 @@ def disc_centre(
 # ----------------------------------------------------------------------
 # Following the marker from frame to frame.
 
-_RUN = 4
-"""Frames of a third difference."""
+_RUNS = range(4, 11)
+"""Frames of differences, from the third to the ninth."""
+_FEWEST_RUNS = 20
+_REST_PX = 0.3
+"""Step from frame to frame below which a codec may send nothing anew."""
+_SETTLED = 0.85
+"""Of the differences of one order less, from which on they are noise: those of a motion fall by more."""
 
 
-def scatter_px(centres_px: FloatArray, times_s: FloatArray) -> float:
-    """Standard deviation of a coordinate by third differences of a track, which a smooth motion has none of.
+def first_wave_share(discs_of: Sequence[Disc]) -> float:
+    """How many times the long waves of the discs' outlines the first one is, which moves the centre.
 
-    It sees what edges do not tell, as a codec that moves the whole marker. Motion that changes within four
-    frames counts as scatter. Frames may be as uneven as their times say, or even with times that are not.
+    A codec errs alike along a part of the outline: its waves fall as 1 / (1 + (tau k)^2) with their order k,
+    and those of independent edges are alike, for which this is 1.
+    """
+    outline_px = 2 * np.pi * float(np.median([one.radius_px for one in discs_of]))
+    count = int((outline_px / _ORDERS >= _SHORTEST_PX).sum())
+    if count < _FEWEST_WAVES or len(discs_of) < _FEWEST_RUNS:
+        return 1.0
+    power, square = np.median([one.waves_px2 for one in discs_of], axis=0)[:count], _ORDERS[:count] ** 2
+    long, short = power[:_LONGEST].mean(), power[-_SHORTEST:].mean()
+    k_long, k_short = square[:_LONGEST].mean(), square[-_SHORTEST:].mean()
+    if not long > short:
+        return 1.0
+    # tau^2 from both, at most infinite.
+    tau = (long - short) / max(k_short * short - k_long * long, 1e-12)
+    return float(np.sqrt((1.0 + k_long * tau) / (1.0 + tau)))
+
+
+def scatter_px(centres_px: FloatArray, times_s: FloatArray) -> FloatArray:
+    """Standard deviation of a coordinate by differences of a track of which a smooth motion has none, (n,).
+
+    It sees what edges do not tell, as a codec that moves the whole marker. Differences from the third to
+    the ninth are tried, and the least counts of those that fall no more with their order, as those of a
+    motion do. Frames at rest, in slow and in fast motion are apart, as a codec moves what moves; at rest it
+    repeats an error, so that they scatter as those in slow motion. Frames may be as uneven as their times
+    say, or even with times that are not. 0 where the track does not tell, as in few frames.
 
     Parameters
     ----------
-    centres_px : (n, 2) one for each frame, NaN where it was lost. NaN below 20 runs of four frames.
-    times_s : (n,) of the frames, increasing.
+    centres_px : (n, 2) one for each frame, NaN where it was lost. times_s : (n,) of the frames, increasing.
     """
-    if len(centres_px) < _RUN:
-        return float("nan")
-    runs = np.lib.stride_tricks.sliding_window_view
-    places = runs(centres_px, _RUN, axis=0)
-    known = np.isfinite(places).all(axis=(1, 2))
-    if known.sum() < 20:
-        return float("nan")
+    steps = np.hypot(*np.diff(centres_px, axis=0).T)
+    step = np.fmax(np.r_[np.nan, steps], np.r_[steps, np.nan])
+    moving = step >= _REST_PX
+    fast = moving & (step > (np.median(step[moving]) if moving.any() else 0.0))
+    if fast.sum() < 2 * _FEWEST_RUNS:
+        fast[:] = False
+    found = np.zeros(len(step))
+    even_s = np.arange(len(step), dtype=np.float64)
+    differences = [[_differences(centres_px, t, run) for run in _RUNS] for t in (times_s, even_s)]
 
-    def scatter(times: FloatArray) -> float:
-        t = runs(times, _RUN)[known]
-        apart = t[:, :, None] - t[:, None, :] + np.eye(_RUN)
-        weights = 1.0 / apart.prod(axis=2)
-        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-        third = (places[known] * weights[:, None]).sum(axis=2)
-        return float(1.4826 * np.median(np.abs(third)))
+    def scatter(group: BoolArray) -> float:
+        return min((least for each in differences if (least := _settled(each, group)) > 0.0), default=0.0)
 
-    return min(scatter(times_s), scatter(np.arange(len(centres_px), dtype=np.float64)))
+    for group in (slow := moving & ~fast, fast):
+        found[group] = scatter(group)
+    rest = ~moving
+    found[rest] = max(scatter(rest), float(found[slow].max(initial=0.0)))
+    return found
+
+
+def _differences(centres_px: FloatArray, times_s: FloatArray, run: int) -> FloatArray:
+    """Divided differences (n - run + 1, 2) of runs of frames, of the size of a coordinate's noise."""
+    windows = np.lib.stride_tricks.sliding_window_view
+    if len(times_s) < run:
+        return np.zeros((0, 2))
+    t = windows(times_s, run)
+    weights = np.stack(
+        [1.0 / np.prod([t[:, i] - t[:, j] for j in range(run) if j != i], axis=0) for i in range(run)], axis=1
+    )
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    return np.asarray((windows(centres_px, run, axis=0) * weights[:, None]).sum(axis=2))
+
+
+def _settled(differences: Sequence[FloatArray], group: BoolArray) -> float:
+    """The least scatter, of runs about a group's frames, that falls no more with the order; else 0."""
+    scatters = []
+    for run, each in zip(_RUNS, differences, strict=True):
+        about = each[group[run // 2 : run // 2 + len(each)]]
+        known = about[np.isfinite(about).all(axis=1)]
+        scatters.append(1.4826 * float(np.median(np.abs(known))) if len(known) >= _FEWEST_RUNS else np.nan)
+    return min((b for a, b in pairwise(scatters) if b > _SETTLED * a), default=0.0)
 
 
 @dataclass
@@ -608,14 +669,16 @@ def track_rows(
     nowhere = np.full(2, np.nan)
     centres = np.array([nowhere if one is None else one.centre_px for one in found])
     scatter = scatter_px(centres, np.array(times_s[: len(found)]))
-    usual = float(np.median([one.sigma_px for one in seen]))
-    factor = max(1.0, scatter / usual) if np.isfinite(scatter) else 1.0
+    sigmas = np.array([np.nan if one is None else one.sigma_px for one in found]) * first_wave_share(seen)
+    for level in np.unique(scatter):
+        alike = scatter == level
+        sigmas[alike] *= max(1.0, level / float(np.nanmedian(sigmas[alike])))
     rows = []
-    for t_s, one in zip(times_s, found, strict=False):
+    for t_s, one, sigma in zip(times_s, found, sigmas.tolist(), strict=False):
         if one is not None:
             at = one.pixy_px() if pixy else one.centre_px if centre is None else centre(one.centre_px)
             # A whole pixel is off by up to half of one, evenly.
-            rows.append((t_s, float(at[0]), float(at[1]), 12**-0.5 if pixy else factor * one.sigma_px))
+            rows.append((t_s, float(at[0]), float(at[1]), 12**-0.5 if pixy else sigma))
     return rows
 
 
