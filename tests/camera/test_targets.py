@@ -139,6 +139,15 @@ def test_other_targets_are_named(drawing: Drawing, says: str, tmp_path: Path) ->
         find_boards(list_pictures([tmp_path]), None, 1.0)
 
 
+def test_a_grid_of_circles_that_the_border_cuts_is_named(tmp_path: Path) -> None:
+    drawing = _circles(9, 6, "symmetric")
+    for seed in range(3):
+        R, t = pose(drawing, seed, 0.7, 0.0)
+        cv2.imwrite(str(tmp_path / f"{seed}.png"), render(drawing, R, t)[:, :440])
+    with pytest.raises(BadInputError, match="the pictures show a grid of circles; calib reads check"):
+        find_boards(list_pictures([tmp_path]), None, 1.0)
+
+
 def test_round_spots_in_no_grid_are_not_tried_as_one(monkeypatch) -> None:
     rng = np.random.default_rng(4)
     gravel = np.full((480, 640), 60, dtype=np.uint8)

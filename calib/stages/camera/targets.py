@@ -439,6 +439,9 @@ def detect_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> Detecti
 _CIRCLES_PIXELS = 300_000
 _CIRCLES = (12, 300)
 """Round spots of a picture that may show a grid of circles."""
+_FEWEST_OF_PART, _OF_SPOTS = 20, 0.9
+"""Round spots that form one grid, and their share of all, that are a part of a grid of circles."""
+SOME_CIRCLES = "a grid of circles"
 _ROUND = 0.83
 """4 pi area / perimeter^2: of a square pi / 4, of a circle seen at 60 degrees 0.84."""
 _AROUND = 8
@@ -515,8 +518,8 @@ def _sizes(places: IntArray) -> list[tuple[str, int, int]]:
     return [(kind, columns, rows) for kind, columns, rows in sizes if min(columns, rows) >= 3]
 
 
-def circle_grid(gray: GrayImage) -> tuple[str, int, int] | None:
-    """What grid of circles a picture shows: "symmetric" or "asymmetric", circles in a row, and rows.
+def circle_grid(gray: GrayImage) -> str | None:
+    """What grid of circles a picture shows, in words: with its size, or `SOME_CIRCLES` of a part of one.
 
     The spots say the size that OpenCV is asked for. To ask for every size took a minute for each picture
     of gravel.
@@ -525,15 +528,20 @@ def circle_grid(gray: GrayImage) -> tuple[str, int, int] | None:
     parameters = cv2.SimpleBlobDetector.Params()
     parameters.filterByCircularity, parameters.minCircularity = True, _ROUND
     spots = cv2.SimpleBlobDetector.create(parameters)
+    some = False
     for image in (small, cv2.bitwise_not(small)):
         points = np.array([spot.pt for spot in spots.detect(image)]).reshape(-1, 2)
         if not _CIRCLES[0] <= len(points) <= _CIRCLES[1]:
             continue
-        for kind, columns, rows in _sizes(_places(points)):
+        places = _places(points)
+        # Spots that lie anyhow share their places.
+        single = len(np.unique(places, axis=0)) == len(places)
+        some = some or (single and len(places) >= max(_FEWEST_OF_PART, _OF_SPOTS * len(points)))
+        for kind, columns, rows in _sizes(places):
             flag = cv2.CALIB_CB_SYMMETRIC_GRID if kind == "symmetric" else cv2.CALIB_CB_ASYMMETRIC_GRID
             if cv2.findCirclesGrid(image, (columns, rows), flags=flag, blobDetector=spots)[0]:
-                return kind, columns, rows
-    return None
+                return f"{'an' if kind == 'asymmetric' else 'a'} {kind} grid of circles, {columns}x{rows}"
+    return SOME_CIRCLES if some else None
 
 
 def other_board(gray: GrayImage) -> str | None:
@@ -541,12 +549,7 @@ def other_board(gray: GrayImage) -> str | None:
     layout = recognise([gray])
     if layout is not None:
         return "a ChArUco board" if layout.kind == "charuco" else f"a grid of {layout.dictionary} markers"
-    grid = circle_grid(gray)
-    return None if grid is None else _circle_words(*grid)
-
-
-def _circle_words(kind: str, columns: int, rows: int) -> str:
-    return f"{'an' if kind == 'asymmetric' else 'a'} {kind} grid of circles, {columns}x{rows}"
+    return circle_grid(gray)
 
 
 def name_of(pictures: Sequence[GrayImage]) -> str | None:
@@ -555,7 +558,8 @@ def name_of(pictures: Sequence[GrayImage]) -> str | None:
     if not counts:
         mirrored = [np.asarray(cv2.flip(gray, 1), dtype=np.uint8) for gray in pictures]
         return "a board of markers, mirrored: flip the pictures back" if recognise(mirrored) else None
-    (kind, columns, rows), many = counts.most_common(1)[0]
-    if many < max(1, len(pictures) // 3):
-        return None
-    return _circle_words(kind, columns, rows)
+    sized = [(many, grid) for grid, many in counts.items() if grid != SOME_CIRCLES]
+    for many, grid in (max(sized, default=(0, "")), (counts.total(), SOME_CIRCLES)):
+        if many >= max(1, len(pictures) // 3):
+            return grid
+    return None
