@@ -658,6 +658,15 @@ def test_a_command_that_is_written_where_it_changes_holds(folder: Path, least: i
     assert differ.mean() < 0.02
 
 
+def test_pictures_that_share_their_time_stamps_are_refused(folder: Path) -> None:
+    """Five of them at a time, of a clock in steps of 0.1 s that was not followed."""
+    log = read_log(folder / "swing.csv")
+    path = folder / "coarse.csv"
+    write_log(path, replace(log, t_s=np.floor(10.0 * log.t_s) / 10.0))
+    with pytest.raises(BadInputError, match=r"time stamps, in steps of 100 ms"):
+        _read(folder, path.name)
+
+
 def test_pictures_give_the_true_pose_with_the_noise_that_is_said(folder: Path) -> None:
     seen, true = _read(folder, "prbs.csv"), _read(folder, "prbs.csv", truth=True)
     assert (seen.source, true.source) == ("pictures", "truth")

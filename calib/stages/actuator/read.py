@@ -17,6 +17,7 @@ from calib.core.rig import Rig
 from calib.io.columns import is_arm_log
 from calib.io.logs import Log, check_time, read_log
 from calib.io.tables import read_cells
+from calib.solve.clock import clock_step_s
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord, PumpTable, Settled
 from calib.stages.actuator.machine import Machine
@@ -260,6 +261,8 @@ _MOST_TICKS = 10_000_000
 _LONGEST_TICK_S = 0.1
 """No loop that drives a pump is slower."""
 _LATE_S = 0.01
+_SHARED = 0.25
+"""Share of pictures whose time is that of the one before, where a clock's steps could not be followed."""
 _TRUE_SIGMA = (1e-4, 1e-5)
 _LENGTH_SIGMA_M = 2e-4
 
@@ -287,6 +290,13 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path, rest: float) -> tuple[Hea
     state[13] = 0.0
     sigma = math.sqrt(float(setup.noise[0]) ** 2 + float(setup.noise[1]) ** 2 / 12.0)
     seen = heads_seen(setup.view, sensor, pictures.values, rest)
+    if float(np.mean(np.diff(pictures.t_s) == 0.0)) > _SHARED:
+        step = clock_step_s(log.t_s)
+        raise BadInputError(
+            f"{log.source}: {len(pictures)} pictures have {len(np.unique(pictures.t_s))} time stamps, "
+            + (f"in steps of {1e3 * step:.3g} ms, " if step else "")
+            + "expected one for each; write t_s in microseconds, as each picture is taken"
+        )
     found_at = np.isfinite(seen[:, 0])
     t, heads, whitening = pictures.t_s[found_at], seen[found_at], np.empty((int(found_at.sum()), 2, 2))
     for k, head in enumerate(heads):
