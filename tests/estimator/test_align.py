@@ -164,6 +164,18 @@ def test_one_log_on_a_wrong_clock_is_named() -> None:
     assert sum(log.outliers for log in found.logs) < 0.1 * sum(log.pictures for log in found.logs)
 
 
+def test_a_swing_of_four_pictures_in_a_period_is_aligned() -> None:
+    """Each angle is far from the median of five pictures, and what was left turned the other way round."""
+    trial = known(SimulatedRig())
+    logs = [
+        align_log(twin_log(trial.rig, "swing", {"phi_rad": phi}, k)) for k, phi in enumerate(("0.5", "-0.4"))
+    ]
+    slow = [replace(log, camera_s=log.camera_s[::4], pixels=log.pixels[::4]) for log in logs]
+    found = align(slow, prior_settings(trial.view))
+    assert len(found.traces) == 2
+    assert abs(found.sensor[OFFSET] - 0.025) < 3.0 * found.sigma[OFFSET] < 3e-3
+
+
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:
     nominal = SimulatedRig()
     tracker = replace(nominal.tracker, outliers=0.03, dropouts=0.05, blackouts_s=((1.0, 0.4),))

@@ -440,14 +440,22 @@ def _cuts(log: AlignLog) -> list[float]:
     return [-math.inf, *(0.5 * (both[i] + both[i + 1]) for i in gaps.tolist()), math.inf]
 
 
-def _like_neighbours(phi: FloatArray) -> BoolArray:
-    """Pictures whose angle is near the median of five."""
+def _fives(values: FloatArray) -> FloatArray:
+    """Each of the values (n,) between the two before and the two after it, (n, 5), mirrored at the ends."""
+    padded = np.concatenate([values[2:0:-1], values, values[-2:-4:-1]])
+    return np.lib.stride_tricks.sliding_window_view(padded, 5)
+
+
+def _like_neighbours(phi: FloatArray, turned: FloatArray) -> BoolArray:
+    """Pictures whose angle is near the median of five, but for what the gyroscope has turned (n,) meanwhile.
+
+    Of a swing of which there are three pictures in a period all are far from that median.
+    """
     if len(phi) < 5:
         return np.isfinite(phi)
     filled = np.where(np.isfinite(phi), phi, np.nanmedian(phi) if np.isfinite(phi).any() else 0.0)
-    padded = np.concatenate([filled[2:0:-1], filled, filled[-2:-4:-1]])
-    off = filled - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    limit = max(6.0 * robust_sigma(off), 0.04)
+    off, swung = (one - np.median(_fives(one), axis=1) for one in (filled, turned))
+    limit = max(6.0 * robust_sigma(off), 0.04) + np.abs(_fives(swung)).max(axis=1)
     return np.asarray(np.isfinite(phi) & (np.abs(off) <= limit))
 
 
@@ -499,7 +507,7 @@ def pieces_of(
             pixels, readings = log.pixels[seen], log.readings[felt]
             phi, length = heads_seen(view, sensor, pixels, _LENGTH_M).T.copy()
             theta = _integrated(imu.t_s, readings[:, 2])
-            fine = _like_neighbours(phi)
+            fine = _like_neighbours(phi, np.interp(camera.t_s, imu.t_s, theta))
             pieces.append(Piece(number, camera, imu, pixels, readings, phi, length, fine, theta))
             kept += 1
         if kept == 0:

@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x6237AF21UL
+#define CALIB_ID 0x1ABF25F1UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -176,7 +176,7 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0618749782f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0618749745f /* subtracted from ax, m/s^2 */
 #define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0342377052f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.0032959f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00599833252f /* gz at rest, rad/s; sign as read; for programs of your own */
