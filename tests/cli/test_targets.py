@@ -48,6 +48,14 @@ def test_partial_views_make_a_camera(calib, folder, made, tmp_path) -> None:
     assert named.code in (0, 1) and "inner corners and markers of 4X4_50" in named.err
 
 
+def test_a_mirrored_picture_among_others_is_named(calib, folder, tmp_path) -> None:
+    few = _few(folder, tmp_path)
+    mirrored = cv2.imread(str(few / "view2.png"))[:, ::-1]
+    cv2.imwrite(str(few / "view2.png"), mirrored)
+    ended = calib("intrinsics", few, "--rig", tmp_path / "rig.yaml")
+    assert "view2.png: shows the ChArUco board mirrored" in ended.err
+
+
 def _few(folder: Path, place: Path) -> Path:
     """Three of the pictures."""
     few = place / "few"

@@ -33,6 +33,7 @@ from calib.stages.camera.targets import (
     detect_charuco,
     find_markers,
     in_place,
+    is_mirrored,
     name_of,
     recognise,
     with_rows,
@@ -317,12 +318,17 @@ class _Search:
         why = f"shows no {what} with {board.columns}x{board.rows} inner corners that can be read"
         target = board.points_m()
         seen = [(picture, detection) for i, picture in enumerate(self.pictures) if (detection := found[i])]
+        unread = [i for i, detection in found.items() if layout and not detection and i not in self.damaged]
+        mirrored = dict(
+            zip(unread, self._each([(is_mirrored, i, (layout,)) for i in unread], unread), strict=True)
+        )
+        flipped = f"shows the {what} mirrored, as a selfie camera stores it: flip it back"
         return BoardSearch(
             board=board,
             image_size_px=self.size_px,
             views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
             left_out=tuple(
-                self.damaged.get(i, LeftOut(picture.name, why, "no board"))
+                self.damaged.get(i) or LeftOut(picture.name, flipped if mirrored.get(i) else why, "no board")
                 for i, picture in enumerate(self.pictures)
                 if found[i] is None
             ),

@@ -368,6 +368,12 @@ def _ordered(
     )
 
 
+def is_mirrored(gray: GrayImage, layout: Layout) -> bool:
+    """Whether a picture shows a board of markers as in a mirror, such as a selfie camera stores."""
+    flipped = np.asarray(cv2.flip(_reduced(gray, _PROBE_PIXELS), 1), dtype=np.uint8)
+    return len(in_place(find_markers(flipped, layout.dictionary), layout)[0].ids) >= _FEWEST_MARKERS
+
+
 def detect_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> Detection | None:
     """Corners of a ChArUco board, of which a picture may show any part.
 
