@@ -53,7 +53,7 @@ def test_a_mirrored_picture_among_others_is_named(calib, folder, tmp_path) -> No
     mirrored = cv2.imread(str(few / "view2.png"))[:, ::-1]
     cv2.imwrite(str(few / "view2.png"), mirrored)
     ended = calib("intrinsics", few, "--rig", tmp_path / "rig.yaml")
-    assert "view2.png: shows the ChArUco board mirrored" in ended.err
+    assert "view2.png: shows the ChArUco board mirrored" in ended.out
 
 
 def _few(folder: Path, place: Path) -> Path:
