@@ -693,6 +693,15 @@ def test_a_board_that_begins_within_the_swing_is_not_joined_a_period_off(with_pl
     assert moved.sampled("u_px").size and moved.t_s[moved.sampled("u_px")][-1] == camera.t_s[-1] + 1234.5
 
 
+def test_pictures_as_in_a_mirror_are_told() -> None:
+    camera, board = _apart(twin_log(RIG, "prbs", {}, 3), 1234.567)
+    turned = replace(board, columns=board.columns | {"gz_radps": -board.columns["gz_radps"]})
+    with pytest.raises(
+        BadInputError, match=r"track\.csv: turns the other way round than gz_radps of board\.csv"
+    ):
+        joined(camera, turned, _rig_file(), "rig.yaml")
+
+
 def test_logs_of_one_clock_are_merged_as_they_are() -> None:
     camera, board = _apart(twin_log(RIG, "static", {}, 3), 0.0)
     log, found, outside = joined(camera, board, Rig(), "rig.yaml", 0.0)

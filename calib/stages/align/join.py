@@ -15,6 +15,10 @@ _LONGEST_S = 6.0 * 3600.0
 DRIFT_S = 0.004
 """Between the halves of a recording, beyond which it is told."""
 
+_MIRRORED = 0.25
+"""What the next best offset leaves of a motion that is mirrored, at least; the end of a swing, half a period
+off, is mirrored as well, and its next best leaves 0.13."""
+
 
 def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, bool]:
     """Times, angle or way along the marker's main direction, and whether it is an angle."""
@@ -54,6 +58,14 @@ def joined(
         camera_s, way, scaled = _way(camera, rig, rig_name)
         found = clocks(camera_s, way, gyro.t_s, gyro["gz_radps"], scaled)
         if found is None:
+            other = clocks(camera_s, -way, gyro.t_s, gyro["gz_radps"], scaled) if scaled else None
+            if other is not None and other.next_left > _MIRRORED:
+                raise BadInputError(
+                    f"{camera.source}: turns the other way round than gz_radps of {board.source}, expected "
+                    "minus the rate of phi; pictures as of a selfie camera are mirrored: flip those of board "
+                    "and marker; an IMU has its x axis from the head to the base; a camera upside down may "
+                    "have read the plane's board from its other end: state first_corner_px in its board.yaml"
+                )
             raise BadInputError(
                 f"{camera.source}: its motion and that of {board.source} do not tell one offset of their "
                 "clocks, expected quick turns of different sizes at uneven times, or with camera and plane "
