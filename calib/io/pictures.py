@@ -234,8 +234,8 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
         if decoded is None or damage is not None:
             why = "" if damage is None else f" ({damage.removeprefix('Corrupt JPEG data: ')[:80]})"
             raise BadInputError(f"{where}: is a truncated or damaged JPEG{why}")
-    elif data[4:8] == b"ftyp" and b"avif" not in data[8:40]:
-        decoded = _heic(data, where)
+    elif is_heic(data):
+        decoded = decoded_heic(data, where)
     else:
         decoded = _decoded(data)
     if decoded is None or decoded.size == 0:
@@ -244,8 +244,16 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     return Picture(name, digest, eight_bits(decoded), (width, height))
 
 
-def _heic(data: bytes, where: str) -> AnyArray | None:
-    """A HEIC picture, turned back to the sensor's own rows: its decoder holds it upright."""
+def is_heic(data: bytes) -> bool:
+    """Whether these are the bytes of a HEIF picture that OpenCV does not decode."""
+    return data[4:8] == b"ftyp" and b"avif" not in data[8:40]
+
+
+def decoded_heic(data: bytes, where: str) -> AnyArray | None:
+    """Grey values of a HEIC picture, turned back to the sensor's own rows; None of a damaged one.
+
+    Its decoder holds it upright. Raises `BadInputError` without the package that decodes it.
+    """
     needed = f"{where}: reading HEIC needs the package pillow-heif: {pip_install('pictures')}"
     pillow_heif = package("pillow_heif", needed)
     try:

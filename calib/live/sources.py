@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import time
@@ -15,7 +16,7 @@ from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
 from calib.io.frames import opened_video
-from calib.io.pictures import declared_pixels, holds_pictures, list_pictures
+from calib.io.pictures import declared_pixels, decoded_heic, holds_pictures, is_heic, list_pictures
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 MOST_PIXELS = 30_000_000
@@ -119,7 +120,15 @@ class Watched:
 
     def read(self) -> AnyArray | None:
         """As `Source.read`."""
-        there = list_pictures([self._folder]) if holds_pictures(self._folder) else []
+        there: list[Path] = []
+        # It may go at any moment, as that of a network or a card does.
+        with contextlib.suppress(BadInputError):
+            there = list_pictures([self._folder]) if holds_pictures(self._folder) else []
+        gone = f"{shown(self._folder)}: is gone, or is no folder any more; it is looked for again."
+        if not self._folder.is_dir():
+            self.fault = gone
+        elif self.fault == gone:
+            self.fault = ""
         for path in there:
             try:
                 found = path.stat()
@@ -131,14 +140,17 @@ class Watched:
                 continue
             self._done[path.name] = stamp
             self.fault = ""
+            frame = None
             try:
                 data = read_bytes(path)
+                pixels = declared_pixels(data) or 0
+                if pixels > MOST_PIXELS:
+                    raise BadInputError(f"{shown(path)}: has more than {MOST_PIXELS // 10**6} million pixels")
+                if pixels > 0:
+                    frame = decoded_heic(data, shown(path)) if is_heic(data) else decode(data)
             except BadInputError as error:
                 self.fault = str(error)
                 return None
-            frame = None
-            if 0 < (declared_pixels(data) or 0) <= MOST_PIXELS:
-                frame = decode(data)
             if frame is None:
                 self.fault = f"{shown(path)} is not a picture that can be decoded (yet)."
             return frame

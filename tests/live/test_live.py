@@ -291,6 +291,33 @@ def test_a_picture_whose_clock_is_ahead_is_looked_at(tmp_path: Path) -> None:
     assert Watched(tmp_path, lambda: written_s - 3600.0).read() is not None
 
 
+def test_a_watched_folder_may_go_and_come_again(tmp_path: Path) -> None:
+    folder, later = tmp_path / "shots", lambda: time.time() + 10.0
+    folder.mkdir()
+    watched = Watched(folder, later)
+    for _ in range(2):
+        cv2.imwrite(str(folder / "a.png"), np.full((48, 64), 90, dtype=np.uint8))
+        assert watched.read() is not None and watched.fault == ""
+        shutil.rmtree(folder)
+        assert watched.read() is None and "shots: is gone" in watched.fault
+        folder.mkdir()
+        assert watched.read() is None and watched.fault == ""
+
+
+def test_a_phones_heic_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif")
+    from PIL import Image
+
+    grey = np.full((64, 96), 90, dtype=np.uint8)
+    grey[:, :40] = 200
+    pillow_heif.from_pillow(Image.fromarray(grey)).save(tmp_path / "a.heic", quality=-1)
+    seen = Watched(tmp_path, lambda: time.time() + 10.0).read()
+    assert seen is not None and np.abs(seen.astype(int) - grey).mean() < 1.0
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    watched = Watched(tmp_path, lambda: time.time() + 10.0)
+    assert watched.read() is None and "a.heic: reading HEIC needs the package pillow-heif" in watched.fault
+
+
 @pytest.mark.slow
 def test_a_video_is_looked_at_as_a_camera_would_be(tmp_path: Path) -> None:
     person = Person(np.random.default_rng(0))
