@@ -235,6 +235,7 @@ class Passed:
     truncated : whether the last line was cut short and left out.
     wraps : how often the counter that is the time began again.
     sorted : rows that stood below a later one, and were put where they belong.
+    twice : rows that say what the one before says, at its time, and were left out.
     """
 
     not_finite: int = 0
@@ -246,6 +247,7 @@ class Passed:
     clipped: int = 0
     end: str = ""
     sorted: int = 0
+    twice: int = 0
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -258,6 +260,7 @@ class Passed:
             self.clipped + later.clipped,
             self.end or later.end,
             self.sorted + later.sorted,
+            self.twice + later.twice,
         )
 
     @property
@@ -275,6 +278,7 @@ class Passed:
             (self.truncated, "the last line is cut short and left out"),
             (self.wraps, f"the time is a counter that begins again {self.wraps} times, and is counted on"),
             (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
+            (self.twice, f"{self.twice} rows are written twice; left out"),
         )
         return [sentence for there, sentence in kinds if there]
 

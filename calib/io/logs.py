@@ -445,6 +445,19 @@ def in_order(log: Log) -> Log:
     return replace(log, t_s=log.t_s[rows], columns=columns, lines=log.lines[rows], passed=passed)
 
 
+def once(log: Log) -> Log:
+    """The log without rows that say what the one before says, at its time, which are no other readings."""
+    again = np.diff(log.t_s) == 0.0
+    for column in log.columns.values():
+        again &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    if not again.any():
+        return log
+    rows = np.concatenate([[True], ~again])
+    columns = {name: column[rows] for name, column in log.columns.items()}
+    passed = log.passed + Passed(twice=int(again.sum()))
+    return replace(log, t_s=log.t_s[rows], columns=columns, lines=log.lines[rows], passed=passed)
+
+
 def log_text(log: Log) -> str:
     """CSV of a log: time to the microsecond, values to nine digits, blank where NaN.
 

@@ -241,6 +241,22 @@ def read_states(path: Path) -> dict[str, np.ndarray]:
     return {name: table[name] for name in table.dtype.names}
 
 
+def test_rows_that_are_written_twice_count_once(
+    calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    """As readings of their own they made innovations repeat, 0.48 with the one before."""
+    once, twice = log_file("ellipse"), tmp_path / "twice.csv"
+    head, *rows = once.read_text().splitlines()
+    twice.write_text("\n".join([head, *(row for row in rows for _ in range(2))]) + "\n")
+    states = []
+    for path in (once, twice):
+        ended = calib("replay", path, "--rig", aligned, "-o", tmp_path / "states.csv")
+        assert ended.code == 0
+        states.append((tmp_path / "states.csv").read_text())
+    assert f"{len(rows)} rows are written twice; left out" in ended.out + ended.err
+    assert states[0] == states[1]
+
+
 def test_a_log_becomes_states_with_their_deviations(
     calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
 ) -> None:

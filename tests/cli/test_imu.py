@@ -367,6 +367,17 @@ def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path) -
     assert float(line.split()[3]) == pytest.approx(-0.34, abs=0.03)
 
 
+def test_a_recorder_that_writes_each_row_twice_loses_none(calib: Run, tmp_path: Path) -> None:
+    rows = np.repeat(np.arange(3000), 2)
+    log = _write(tmp_path / "log.csv", _at_rest()[rows], 0.01 * rows)
+    ended = calib("imu", "static", log, "--rig", tmp_path / "rig.yaml")
+    assert ended.code == 0
+    assert "log.csv: 3000 rows (50.00%) repeat the one before; dropped" in ended.out
+    some = np.sort(np.concatenate([np.arange(3000), np.arange(0, 3000, 4)]))
+    log = _write(tmp_path / "some.csv", _at_rest()[some], 0.01 * some)
+    assert calib("imu", "static", log, "--rig", tmp_path / "rig.yaml").code == 1
+
+
 def test_units_are_named_and_converted(calib: Run, tmp_path: Path) -> None:
     scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
     log = _write(tmp_path / "log.csv", _at_rest() * scale)

@@ -103,6 +103,7 @@ class Sampling:
 
 
 _MOST_MISSING = 0.02
+_UNEQUALLY = 0.01
 
 
 def sampling_findings(
@@ -137,8 +138,11 @@ def sampling_findings(
         )
     if s.repeated_rows:
         share = s.repeated_rows / (s.samples + s.repeated_rows)
+        # A recorder that writes each row twice loses none.
+        times = s.repeated_rows / s.samples
+        each = times > 0.5 and abs(times - round(times)) < _UNEQUALLY
         yield Finding(
-            "poor" if share > most_repeated else "remark",
+            "poor" if share > most_repeated and not each else "remark",
             f"{lead}{s.repeated_rows} rows ({share:.2%}) repeat the one before; dropped",
         )
     if s.repeated_stamps:
