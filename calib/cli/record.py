@@ -20,7 +20,7 @@ from calib.core.writing import appending, check_writable, make_folder, writes_th
 if TYPE_CHECKING:
     from calib.io.experiments import Board
 
-_SILENT_S = 10.0
+_SILENT_S, _FELL_SILENT_S = 10.0, 3.0
 _CUT_S = 0.5
 _ALL = "all"
 
@@ -221,17 +221,25 @@ def _ticks(
     refuse_recorded(output)
     check_writable(output, LOG)
     line = _Port(port, baud)
-    began = said = time.monotonic()
+    began = said = came = time.monotonic()
+    count_then = 0
     if duration_s is None and ticks is None:
         narrate("recording; Ctrl-C ends it")
 
     def more(so_far: int) -> bool:
-        nonlocal said
+        nonlocal said, came, count_then
         now = time.monotonic()
         passed = now - began
+        if so_far != count_then:
+            came, count_then = now, so_far
         if so_far == 0 and passed > _SILENT_S:
             raise BadInputError(
                 f"{line.name}: no frame within {_SILENT_S:g} s, expected the example sketch at {baud} baud"
+            )
+        if so_far and now - came > _FELL_SILENT_S:
+            raise BadInputError(
+                f"{line.name}: the board fell silent after {came - began:.1f} s; what came until then is in "
+                f"{shown(output)}; look at cable and supply, and record again"
             )
         if now - said > 0.1:
             line.write(ALIVE)

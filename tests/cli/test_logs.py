@@ -285,6 +285,14 @@ def test_a_board_that_computes_something_else_fails(calib, rig: Path, tmp_path: 
     assert json.loads(ended.out)["check"]["gate"] == ["tick 19 is the first that differs, in q_m"]
 
 
+def test_a_board_that_falls_silent(calib, rig: Path, tmp_path: Path, board, monkeypatch) -> None:
+    monkeypatch.setattr("calib.cli.record._FELL_SILENT_S", 0.3)
+    log, port = tmp_path / "log.csv", board(_stream(header_of(Rig.load(rig), "rig.yaml"), 30))
+    ended = calib("record", port, "-o", log, "--duration", "20s")
+    assert ended.code == 3 and "the board fell silent after" in ended.sentence
+    assert len(read_log(log)) == 30
+
+
 def test_a_port_that_is_not_there(calib, tmp_path: Path) -> None:
     ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "log.csv")
     assert ended.code == 3
