@@ -176,6 +176,32 @@ def test_a_swing_of_four_pictures_in_a_period_is_aligned() -> None:
     assert abs(found.sensor[OFFSET] - 0.025) < 3.0 * found.sigma[OFFSET] < 3e-3
 
 
+@pytest.mark.parametrize(
+    ("turned_deg", "bias_radps", "words", "word"),
+    [
+        (0.0, 0.0, "", "ok"),
+        (0.3, 0.0, "ellipse1: the mount angle differs", "poor"),
+        (0.0, 0.01, "ellipse1: the gyroscope's bias differs from that in the other logs by +0.010", "ok"),
+    ],
+)
+def test_sigma_holds_what_is_another_in_one_log(
+    turned_deg: float, bias_radps: float, words: str, word: str
+) -> None:
+    """What put the angle at rest 5 deviations off, mounted anew in one log, or the bias 30, is in sigma."""
+    trial = known(SimulatedRig())
+    logs = [align_log(twin_log(trial.rig, name, options, k)) for k, (name, options) in enumerate(MOTIONS)]
+    c, s = math.cos(math.radians(turned_deg)), math.sin(math.radians(turned_deg))
+    readings = logs[1].readings @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    logs[1] = replace(logs[1], readings=readings + np.array([0.0, 0.0, bias_radps]))
+    found = align(logs, prior_settings(trial.view))
+    verdict = judge(found)
+    assert verdict.word == word
+    assert any(words in one for one in verdict.remarks) if words else not found.apart
+    assert np.abs(scores(trial, found)).max() < 3.0
+    true_rest = rest_angle(trial.truth)[0]
+    assert abs(found.rest_angle_rad - true_rest) < 3.0 * found.rest_angle_sigma
+
+
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:
     nominal = SimulatedRig()
     tracker = replace(nominal.tracker, outliers=0.03, dropouts=0.05, blackouts_s=((1.0, 0.4),))
