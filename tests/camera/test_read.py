@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -155,6 +156,18 @@ def test_views_come_in_the_order_of_the_pictures(shipped: list[Path]) -> None:
     assert found.board.square_m == 0.02
     assert found.left_out == ()
     assert list(found.hashes) == [path.name for path in paths]
+
+
+def test_a_board_under_a_thumb_in_every_picture(shipped: list[Path], tmp_path: Path) -> None:
+    found = find_boards(shipped[:2], (7, 5), 0.02)
+    for path, view, corner in zip(shipped, found.views, (0, 28), strict=False):
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        (u, v), radius_px = view.pixels[corner], 0.8 * np.linalg.norm(view.pixels[1] - view.pixels[0])
+        cv2.circle(picture, (round(u), round(v)), round(radius_px), 140, -1)
+        cv2.imwrite(str(tmp_path / path.name), picture)
+    covered = find_boards(sorted(tmp_path.iterdir()), None, 0.02)
+    assert (covered.board.columns, covered.board.rows) == (7, 5)
+    assert [len(view.counted()[0]) for view in covered.views] == [34] * 2
 
 
 def test_damaged_pictures_are_named(shipped: list[Path], tmp_path: Path) -> None:

@@ -420,10 +420,11 @@ _SIZE_MISFIT = 0.04
 _LATTICES = 3
 
 
-def _whole(gray: GrayImage, points: FloatArray, within: bool) -> Refined | None:
+def _whole(gray: GrayImage, points: FloatArray, within: bool, covered: bool = False) -> Refined | None:
     """Refine a grid and add the rows that follow it, until there are none; None when it is no board.
 
-    A pattern that leaves the picture on every side has no size; `within` the picture, on any side.
+    A pattern that leaves the picture on every side has no size; `within` the picture, on any side. Something
+    may lie over single corners of one that is `covered`.
     """
     for _ in range(_ROUNDS):
         if min(points.shape[:2]) < 3:
@@ -434,7 +435,7 @@ def _whole(gray: GrayImage, points: FloatArray, within: bool) -> Refined | None:
         around = surroundings(grid)
         top, bottom, left, right = around.continues
         if not any(around.continues):
-            sure = grid.refined.all() and grid.narrow.mean() < _NARROW
+            sure = covered or bool(grid.refined.all() and grid.narrow.mean() < _NARROW)
             sure &= grid.misfit_px < _SIZE_MISFIT * square_px(grid.points)
             return grid if sure and (all if within else any)(around.seen) else None
         wide = _ringed(grid.points)
@@ -450,23 +451,25 @@ def _size(grid: Refined) -> tuple[int, int]:
     return max(rows, columns), min(rows, columns)
 
 
-def find_size(gray: GrayImage, within: bool = False) -> tuple[int, int] | None:
+def find_size(gray: GrayImage, within: bool = False, covered: bool = False) -> tuple[int, int] | None:
     """Inner corners (columns, rows), columns >= rows, of the largest board of one picture.
 
     Parameters
     ----------
     within : only of one that does not reach the picture's border, where it may be a part of a larger one.
+    covered : also of one with single corners that cannot be measured, as under a finger: only what several
+        pictures agree on is a size then.
     """
     if not _shows_something(gray):
         return None
     for zoom in lattice_levels(gray):
         level = resized(gray, zoom)
         lattices = find_lattices(find_saddles(level.image), least=6)[:_LATTICES]
-        whole = [_whole(gray, level.to_picture(p), within) for p in map(complete, lattices) if p is not None]
-        grids = [grid for grid in whole if grid is not None]
+        every = [level.to_picture(p) for p in map(complete, lattices) if p is not None]
+        grids = [grid for p in every if (grid := _whole(gray, p, within, covered)) is not None]
         if grids:
             return _size(max(grids, key=lambda grid: np.prod(np.ptp(grid.points, axis=(0, 1)))))
-    return _size_by_opencv(gray, within)
+    return None if covered else _size_by_opencv(gray, within)
 
 
 def _size_by_opencv(gray: GrayImage, within: bool) -> tuple[int, int] | None:

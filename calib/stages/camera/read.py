@@ -303,9 +303,12 @@ class _Search:
             other_target = self._asked(name_of, sample)
             if other_target is not None:
                 raise BadInputError(f"{_names(pictures)}: {_shows(pictures)} {other_target}; {_READS}")
-            wanted = wanted or self._common_size(range(count))
+            wanted = wanted or self._common_size(range(count)) or self._covered_size(sample)
         if wanted is None:
-            raise BadInputError(f"{_names(pictures)}: no checkerboard found in {_count(count)}")
+            raise BadInputError(
+                f"{_names(pictures)}: no checkerboard found in {_count(count)}, expected a whole one with "
+                "its white border; --corners COLUMNSxROWS helps where something covers corners of it"
+            )
         found |= self._detect([i for i in range(count) if i not in found], wanted)
         if not any(found.values()):
             raise BadInputError(_not_found(pictures, wanted, self._common_size(sample)))
@@ -417,9 +420,19 @@ class _Search:
         """
         new = [i for i in which if i not in self.sizes]
         self.sizes |= zip(new, self._each([(find_size, i, ()) for i in new], new), strict=True)
-        counts = Counter((max(s), min(s)) for i in which if (s := self.sizes[i]) is not None)
-        most = max(counts, key=lambda s: (counts[s], s[0] * s[1]), default=None)
-        return None if most is None or counts[most] < share * len(which) else most
+        return _most_common([self.sizes[i] for i in which], share * len(which))
+
+    def _covered_size(self, which: Sequence[int]) -> tuple[int, int] | None:
+        """The size that most pictures show where a corner is covered in each, if more than one does."""
+        sizes = self._each([(find_size, i, (False, True)) for i in which], which)
+        return _most_common(list(sizes), 2)
+
+
+def _most_common(sizes: Sequence[tuple[int, int] | None], least: float) -> tuple[int, int] | None:
+    """The commonest size of at least so many, the larger in a tie."""
+    counts = Counter(size for size in sizes if size is not None)
+    most = max(counts, key=lambda size: (counts[size], size[0] * size[1]), default=None)
+    return None if most is None or counts[most] < least else most
 
 
 def _not_found(
