@@ -10,9 +10,10 @@ then once more after `calib identify` on the logs that were aligned. Nothing is 
 errors. `--keep` leaves the calibrated folders for another run, which replays only.
 
 The marker sits where its drawing says, or off from there with the deviation `--off`, which rig.yaml then
-states, as one states what a caliper tells. `--undrawn` says in rig.yaml that the drawing is good to 3 mm,
-so that the logs have to find the marker. `--wrong` makes the rigs in a way that the model does not know
-(`WRONG`); with `--keep` they take the pictures of the right rig.
+states, as one states what a caliper tells; then it also moves nearer to the camera than the board lay, or
+farther from it, by a share with the deviation that `align` expects of the plane's stretch. `--undrawn` says
+in rig.yaml that the drawing is good to 3 mm, so that the logs have to find the marker. `--wrong` makes the
+rigs in a way that the model does not know (`WRONG`); with `--keep` they take the pictures of the right rig.
 
 Errors are the mean over q1 and q2 in millimetres after two seconds: their mean over rigs and their 95th
 percentile, of phi in degrees that percentile, and NEES per degree of freedom, mean and largest. NIS is a mean
@@ -52,7 +53,7 @@ from calib.stages.align.section import SENSORS_OF
 from calib.stages.align.solve import rest_angle
 from calib.stages.estimator.replay import replay_log
 from calib.stages.estimator.section import Replayed
-from calib.stages.estimator.sensors import SENSOR
+from calib.stages.estimator.sensors import QUANTITIES, SENSOR
 from calib.twin.folder import LOGS, write_rig_folder
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
@@ -133,6 +134,14 @@ def drawn(seed: int, off_mm: float = 0.0, wrong: str | None = None) -> Simulated
     return replace(rig, imu=imu, tracker=tracker, view=View(camera, tilt @ PLANE.R_CW, t))
 
 
+def above_board(rig: SimulatedRig, seed: int) -> SimulatedRig:
+    """The rig whose marker moves not quite in the plane in which the board lay."""
+    share = QUANTITIES["stretch"].unaligned * float(np.random.default_rng(5000 + seed).normal())
+    normal = rig.view.R_CW[:, 2]
+    nearer = share * float(normal @ rig.view.t_CW_m) * normal
+    return replace(rig, view=replace(rig.view, t_CW_m=rig.view.t_CW_m + nearer))
+
+
 def _log(
     rig: SimulatedRig, kind: str, options: dict[str, str], seed: int, span: float | None, play: bool
 ) -> str:
@@ -152,7 +161,9 @@ def make(folder: Path, seed: int, off_mm: float, wrong: str | None, pictures: Pa
         (folder / "logs").mkdir()
     else:
         write_rig_folder(folder, rig, seed)
-    if wrong:
+    if off_mm:
+        rig = above_board(rig, seed)
+    if wrong or off_mm:
         for k, name in enumerate((*RESTS, *ALIGNED)):
             text = _log(rig, *LOGS[name], 1000 * seed + k, None, wrong == "hysteresis")
             (folder / "logs" / f"{name}.csv").write_text(text)
