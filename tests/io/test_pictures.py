@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
 from calib.io.pictures import declared_pixels, list_pictures, read_picture
+from calib.stages.camera.corners import detect
 
 GRAY = (np.add.outer(np.arange(40), np.arange(60)) * 2).astype(np.uint8)
 
@@ -52,6 +53,22 @@ def test_depths_and_channels_become_grey(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_picture(tmp_path / "alpha.png").gray, GRAY)
     np.testing.assert_array_equal(read_picture(tmp_path / "colour.png").gray, GRAY)
     assert read_picture(tmp_path / "tiny.png").size_px == (1, 1)
+
+
+@pytest.mark.parametrize("filters", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_a_raw_picture_is_read_without_its_mosaic(project_root: Path, tmp_path: Path, filters: str) -> None:
+    path = project_root / "images" / "view03.png"
+    gray = read_picture(path).gray
+    raw = gray.astype(float)
+    for k, colour in enumerate(filters):
+        raw[k // 2 :: 2, k % 2 :: 2] *= {"R": 0.7, "G": 1.0, "B": 0.55}[colour]
+    cv2.imwrite(str(tmp_path / "raw.png"), np.rint(raw).astype(np.uint8))
+    whole, behind = (detect(read_picture(one).gray, 7, 5) for one in (path, tmp_path / "raw.png"))
+    assert whole is not None and behind is not None
+    # Not even a tenth of a pixel goes to a step between the colours' grids.
+    np.testing.assert_allclose(behind.pixels, whole.pixels, atol=0.1)
+    assert abs(np.mean(behind.pixels - whole.pixels)) < 0.01
+    np.testing.assert_array_equal(gray, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
 
 
 def test_exif_orientation_is_left_alone(tmp_path: Path) -> None:
