@@ -15,6 +15,7 @@ from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none
 from calib.core.rig import Geometry
+from calib.core.units import unit_of
 from calib.core.verdict import Finding, Verdict
 from calib.core.words import all_of
 from calib.solve.clock import COARSE, TimeAxis, clock_step_s, time_axis
@@ -1378,6 +1379,14 @@ def _differing(found: Alignment) -> Iterator[Finding]:
             )
 
 
+_SHOWN = {"": (100.0, "%"), "m": (1e3, "mm"), "s": (1e3, "ms"), "rad": (180.0 / math.pi, "deg")}
+_SHIFTS = ("shift_x_m", "shift_y_m", "stretch")
+_MOVED = (
+    "find the plane again: its board lay elsewhere or has another square, or the camera has moved since; a "
+    "video may store its colours half a pixel aside, which moves the marker by 0.4 px"
+)
+
+
 def _known(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
     offset = float(sigma[_OFFSET])
@@ -1406,8 +1415,11 @@ def _known(found: Alignment) -> Iterator[Finding]:
         away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
         # A delay that the logs tell is a delay, however long.
         if away > _BEYOND_PRIOR and (k != _OFFSET or offset > _OFFSET_S[0]):
-            text = f"{QUANTITIES[name].words} came out as {found.sensor[k]:.3g}, which is not to be expected"
-            yield Finding("poor", text)
+            # In the units of the table.
+            scale, unit = _SHOWN.get(unit_of(name), (1.0, unit_of(name)))
+            value, mean, spread = (scale * float(x[k]) for x in (found.sensor, found.mean, found.prior))
+            text = f"came out as {value:.3g} {unit}, expected {mean:.3g} +- {spread:.2g} {unit}"
+            yield Finding("poor", f"{QUANTITIES[name].words} {text}", _MOVED if name in _SHIFTS else "")
 
 
 def _separable(found: Alignment) -> Iterator[Finding]:
