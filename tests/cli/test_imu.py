@@ -378,6 +378,19 @@ def test_a_recorder_that_writes_each_row_twice_loses_none(calib: Run, tmp_path: 
     assert calib("imu", "static", log, "--rig", tmp_path / "rig.yaml").code == 1
 
 
+@pytest.mark.parametrize("kept", [0.3, 0.5])
+def test_half_of_the_samples_missing_is_poor_as_a_tenth_is(calib: Run, tmp_path: Path, kept: float) -> None:
+    """No steady rate is seen, so gaps were not counted, and noise 1.6 times the true one was ok."""
+    rows = np.flatnonzero(np.random.default_rng(2).random(3000) < kept)
+    log = _write(tmp_path / "log.csv", _at_rest()[rows], 0.01 * rows)
+    ended = calib("imu", "static", log, "--rig", tmp_path / "rig.yaml")
+    assert ended.code == 1
+    assert "of the samples are missing" in ended.out
+    uneven = np.sort(np.random.default_rng(3).uniform(0.0, 30.0, 3000))
+    log = _write(tmp_path / "uneven.csv", _at_rest(), uneven)
+    assert "samples are missing" not in calib("imu", "static", log, "--rig", tmp_path / "rig.yaml").out
+
+
 def test_units_are_named_and_converted(calib: Run, tmp_path: Path) -> None:
     scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
     log = _write(tmp_path / "log.csv", _at_rest() * scale)

@@ -13,7 +13,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.io.logs import clipped
-from calib.solve.clock import Gap, Part, time_axis
+from calib.solve.clock import SPLIT_S, Gap, Part, time_axis
 
 # ----------------------------------------------------------------------
 # How a log was sampled: rate, jitter, gaps, repeated rows and stamps, steps, readings at their limit.
@@ -82,6 +82,7 @@ class Sampling:
     gaps : in order of time.
     step : (axes,) quantisation step in the axis's unit, NaN where none is seen.
     at_limit : (axes,) readings at the end of a usual range, several in a row.
+    dropped : share of the samples that a sensor which is not steady seems to lack.
     """
 
     samples: int
@@ -95,6 +96,7 @@ class Sampling:
     gaps: tuple[Gap, ...]
     step: FloatArray
     at_limit: IntArray
+    dropped: float = 0.0
 
     @property
     def missing(self) -> int:
@@ -104,6 +106,23 @@ class Sampling:
 
 _MOST_MISSING = 0.02
 _UNEQUALLY = 0.01
+_FEWEST_STEPS, _OFF_WHOLE, _MOSTLY = 100, 0.15, 0.95
+"""Steps of stamps that say something, how far one may be from a whole number of the usual shortest one, and
+the share that is no further: where samples are dropped, not taken unevenly."""
+
+
+def _dropped(t_s: FloatArray) -> float:
+    """Share of the samples that are missing where all steps of the stamps (n,) are whole ones; else 0."""
+    steps = np.diff(t_s)
+    steps = steps[(steps > 0.0) & (steps <= SPLIT_S)]
+    if len(steps) < _FEWEST_STEPS:
+        return 0.0
+    short = float(np.quantile(steps, 0.05))
+    count = steps / float(np.median(steps[steps < 1.5 * short]))
+    whole = np.rint(count)
+    if np.mean(np.abs(count - whole) < _OFF_WHOLE) < _MOSTLY:
+        return 0.0
+    return float(1.0 - len(steps) / max(whole.sum(), 1.0))
 
 
 def sampling_findings(
@@ -117,7 +136,13 @@ def sampling_findings(
     most_repeated : share of repeated rows above which the log is poor.
     """
     lead = f"{source}: " if source else ""
-    if not s.steady:
+    if not s.steady and s.dropped > _MOST_MISSING:
+        yield Finding(
+            "poor",
+            f"{lead}{s.dropped:.0%} of the samples are missing, as the time stamps' steps are whole ones of "
+            "the shortest; what is left is filled by straight lines, which changes the noise",
+        )
+    elif not s.steady:
         yield Finding(
             "remark",
             f"{lead}the steps of the time stamps are uneven; the stamps are taken as they are, and where "
@@ -217,6 +242,7 @@ def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
         repeated_stamps=axis.repeated,
         gaps=axis.gaps,
         step=np.array([_step(column) for column in values.T]),
+        dropped=0.0 if axis.steady else _dropped(t_s),
         at_limit=np.array(
             [clipped(column, bool(g)).sum() for column, g in zip(values.T, log.gyro, strict=True)],
             dtype=np.int64,
