@@ -206,6 +206,18 @@ def test_beside_a_bad_view_no_other_looks_turned(kind: str) -> None:
         assert {one.name for one in found} <= {"bad"}
 
 
+def test_two_covered_corners_leave_without_their_view() -> None:
+    views = take(
+        np.random.default_rng(3), camera_of(), 12, recipe=Recipe(noise_px=0.01, tilt_deg=(15.0, 40.0))
+    )
+    pixels = views[4].pixels.copy()
+    pixels[[0, 9]] += [[0.3, -0.2], [0.1, 0.35]]
+    views[4] = replace(views[4], pixels=pixels)
+    found = triage(calibrate(pack(views), SIZE, "radial2"))
+    assert [(one.name, one.kind) for one in found.left_out] == [("v04", "points")]
+    assert found.left_out[0].why.startswith("without 2 of its points, up to 0.36 px from")
+
+
 def test_more_than_a_fifth_leaving_is_a_finding() -> None:
     rng = np.random.default_rng(2)
     camera = camera_of()

@@ -67,6 +67,11 @@ _MOVED_SIGMAS = 1.0
 _MOVED_PX = 0.02
 """A view matters that moves a parameter, and a direction in the picture, by more than this; pixels at up to
 1000 pixels' width."""
+_NEAR_FLOOR_PX = 0.06
+"""How far from where the others put it a point is at least that is to blame for its view, in pixels at up to
+1000 pixels' width."""
+_FEW_POINTS = 0.1
+"""Most of a view's points, as a share, that may be to blame for it."""
 _POINTS_SHARE = 0.3
 """A view that loses more of its points than this leaves whole."""
 _TOLD = 1e-3
@@ -447,6 +452,7 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
     views = everything.views
     scale = scale_of(calibration.camera.image_size_px)
     kept, far = np.ones(views, dtype=np.bool_), np.zeros(everything.present.shape, dtype=np.bool_)
+    floor_px = np.full(views, Limits.point_floor_px)
     reasons: dict[int, str] = {}
     scale_px = 0.0
     fit = calibration
@@ -454,7 +460,8 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
         whole, seen = _with_all(fit, kept, everything, far)
         distance = np.linalg.norm(whole.residuals_px, axis=2)
         there = np.isfinite(distance)
-        new_far = far_points(distance, there, float(np.median(distance[there & kept[:, None]])))
+        typical = float(np.median(distance[there & kept[:, None]]))
+        new_far = far_points(distance, there, typical, floor_px)
         share = new_far.sum(axis=1) / everything.present.sum(axis=1)
         nowhere = "no pose of the board explains it with the other views' camera"
         why = {int(i): nowhere for i in np.flatnonzero(~seen)}
@@ -472,6 +479,13 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
             # A view is asked again without its far points before it leaves for them.
             fresh = kept & (new_far & ~far).any(axis=1)
             leaves = asked.leaving(scale) & ~fresh[usable]
+            # Nor for a few corners that something lies over, which are far off for this view alone.
+            doubted = usable[leaves]
+            floor_px[doubted] = np.minimum(floor_px[doubted], _NEAR_FLOOR_PX * scale)
+            nearer = far_points(distance, there, typical, floor_px) & ~new_far
+            few = nearer.any(axis=1) & ((nearer | new_far).mean(axis=1) < _FEW_POINTS)
+            new_far |= nearer & few[:, None]
+            leaves &= ~few[usable]
             why |= {
                 int(usable[k]): _sentence(asked, int(k), part, int((~leaves).sum()))
                 for k in np.flatnonzero(leaves)

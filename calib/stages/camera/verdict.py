@@ -533,10 +533,18 @@ def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
         yield Finding("remark", text, "Look at the corners with the largest errors, or use a robust loss.")
 
 
-def far_points(distance: FloatArray, there: BoolArray, typical: float) -> BoolArray:
-    """Points (N, M), of those that are there, far off beside the others of their view and a typical one."""
+def far_points(
+    distance: FloatArray,
+    there: BoolArray,
+    typical: float,
+    floor_px: FloatArray | float = Limits.point_floor_px,
+) -> BoolArray:
+    """Points (N, M), of those that are there, far off beside the others of their view and a typical one.
+
+    `floor_px` (N,) is how far off a point of a view has to be at least.
+    """
     own = np.array([np.median(d[on]) if on.any() else 0.0 for d, on in zip(distance, there, strict=True)])
-    limit = np.maximum(Limits.point_factor * np.maximum(own, typical), Limits.point_floor_px)
+    limit = np.maximum(Limits.point_factor * np.maximum(own, typical), floor_px)
     return np.asarray(there & (np.nan_to_num(distance) > limit[:, None]))
 
 
