@@ -215,7 +215,7 @@ def test_two_covered_corners_leave_without_their_view() -> None:
     views[4] = replace(views[4], pixels=pixels)
     found = triage(calibrate(pack(views), SIZE, "radial2"))
     assert [(one.name, one.kind) for one in found.left_out] == [("v04", "points")]
-    assert found.left_out[0].why.startswith("without 2 of its points, up to 0.36 px from")
+    assert found.left_out[0].why.startswith("without 2 of its points, up to 0.37 px from")
 
 
 def test_more_than_a_fifth_leaving_is_a_finding() -> None:
