@@ -286,7 +286,7 @@ class _Search:
         sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
         if dictionary is not None:
             return self._with_markers(corners, self._layout(sample, dictionary), dictionary)
-        wanted = corners or self._common_size(sample)
+        wanted = corners or self._common_size(sample) or self._covered_size(sample)
         found: dict[int, Detection | None] = {}
         # A wrong size is known after a few pictures; looking for it in all of them would take long.
         for part, share in ((sample[:2], 1.0), (sample[2:], 0.5)):
@@ -303,7 +303,7 @@ class _Search:
             other_target = self._asked(name_of, sample)
             if other_target is not None:
                 raise BadInputError(f"{_names(pictures)}: {_shows(pictures)} {other_target}; {_READS}")
-            wanted = wanted or self._common_size(range(count)) or self._covered_size(sample)
+            wanted = wanted or self._common_size(range(count))
         if wanted is None:
             raise BadInputError(
                 f"{_names(pictures)}: no checkerboard found in {_count(count)}, expected a whole one with "
