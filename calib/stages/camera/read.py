@@ -286,7 +286,7 @@ class _Search:
         sample = list(range(0, count, max(1, count // _SIZE_SAMPLE)))
         if dictionary is not None:
             return self._with_markers(corners, self._layout(sample, dictionary), dictionary)
-        wanted = corners or self._common_size(sample) or self._covered_size(sample)
+        wanted = corners or self._usual_size(sample)
         found: dict[int, Detection | None] = {}
         # A wrong size is known after a few pictures; looking for it in all of them would take long.
         for part, share in ((sample[:2], 1.0), (sample[2:], 0.5)):
@@ -422,10 +422,17 @@ class _Search:
         self.sizes |= zip(new, self._each([(find_size, i, ()) for i in new], new), strict=True)
         return _most_common([self.sizes[i] for i in which], share * len(which))
 
-    def _covered_size(self, which: Sequence[int]) -> tuple[int, int] | None:
-        """The size that most pictures show where a corner is covered in each, if more than one does."""
-        sizes = self._each([(find_size, i, (False, True)) for i in which], which)
-        return _most_common(list(sizes), 2)
+    def _usual_size(self, which: Sequence[int]) -> tuple[int, int] | None:
+        """As `_common_size`; where less than half of the pictures are sure, those with covered corners count too.
+
+        A hand that lies along a side makes a smaller board of a picture.
+        """
+        sure = self._common_size(which, 0.5)
+        if sure is not None:
+            return sure
+        others = [i for i in which if self.sizes[i] is None]
+        covered = self._each([(find_size, i, (True, True)) for i in others], others)
+        return _most_common([*(self.sizes[i] for i in which), *covered], 2) or self._common_size(which)
 
 
 def _most_common(sizes: Sequence[tuple[int, int] | None], least: float) -> tuple[int, int] | None:
