@@ -423,7 +423,7 @@ class _Search:
         return _most_common([self.sizes[i] for i in which], share * len(which))
 
     def _usual_size(self, which: Sequence[int]) -> tuple[int, int] | None:
-        """As `_common_size`; where less than half of the pictures are sure, those with covered corners count too.
+        """As `_common_size`; where less than half of them are sure, those with covered corners count too.
 
         A hand that lies along a side makes a smaller board of a picture.
         """
