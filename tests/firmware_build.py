@@ -19,7 +19,7 @@ import pytest
 from firmware_rigs import header
 
 from calib.io.serial import Inputs
-from calib.stages.firmware.conformance import FusedReference, Reference, binary32
+from calib.stages.firmware.conformance import binary32, reference_of
 from calib.stages.firmware.header import VERBATIM, Header, verbatim
 from calib.stages.firmware.vectors import TOLERANCE
 
@@ -288,7 +288,7 @@ def compare(
     What the fused estimator may have decided otherwise lies within a micrometre of its limits.
     """
     constants = header.values
-    reference = FusedReference(constants, undistort, mean_rate) if fused else Reference(constants, undistort)
+    reference = reference_of(constants, undistort, fused, mean_rate)
     wanted, undecided = [], 0.0
     for k, given in enumerate(ticks):
         out = reference.step(given, int(found.flags[k]))

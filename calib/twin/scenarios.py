@@ -41,7 +41,7 @@ class StepResponse:
     ----------
     reach_s : first time at the set-point.
     peak : greatest value.
-    settle_s : time after which the error stays within the band.
+    settle_s : time after which the error stays within 2 % of the set-point.
     """
 
     reach_s: float | None
@@ -49,22 +49,26 @@ class StepResponse:
     settle_s: float | None
 
 
-def step_response(tick_s: float, values: FloatArray, wanted: float, band: float = 0.02) -> StepResponse:
-    """Response (n,), sampled from the step on, to a rising step to `wanted`; band as a share of it."""
+_BAND, _FALLEN = 0.02, 0.05
+"""Shares: of the set-point, within which a response has settled; of the first value, below which it fell."""
+
+
+def step_response(tick_s: float, values: FloatArray, wanted: float) -> StepResponse:
+    """Response (n,), sampled from the step on, to a rising step to `wanted`."""
     above = np.nonzero(values >= wanted)[0]
     reach = None
     if len(above):
         i = int(above[0])
         part = 0.0 if i == 0 else (wanted - values[i - 1]) / (values[i] - values[i - 1])
         reach = float((i - 1 + part) * tick_s) if i else 0.0
-    outside = np.nonzero(np.abs(values - wanted) > band * abs(wanted))[0]
+    outside = np.nonzero(np.abs(values - wanted) > _BAND * abs(wanted))[0]
     last = int(outside[-1]) + 1 if len(outside) else 0
     return StepResponse(reach, float(values.max()), last * tick_s if last < len(values) else None)
 
 
-def fall_time_s(tick_s: float, values: FloatArray, share: float = 0.05) -> float | None:
-    """Time until values (n,), sampled from the beginning of the fall on, are below a share of the first."""
-    below = np.nonzero(values < share * values[0])[0]
+def fall_time_s(tick_s: float, values: FloatArray) -> float | None:
+    """Time until values (n,), sampled from the beginning of the fall on, are below 5 % of the first."""
+    below = np.nonzero(values < _FALLEN * values[0])[0]
     return float(below[0] * tick_s) if len(below) else None
 
 

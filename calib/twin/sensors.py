@@ -179,21 +179,13 @@ def head_motion(c: Coefficients, states: FloatArray) -> HeadMotion:
     return HeadMotion(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:5], rows[:, 5:7])
 
 
-def stamps(
-    t_s: FloatArray, jitter_s: float, duplicated: float, bits: np.random.PCG64, late: FloatArray | None = None
-) -> FloatArray:
+def stamps(t_s: FloatArray, jitter_s: float, duplicated: float, bits: np.random.PCG64) -> FloatArray:
     """Time stamps (n,) that a logger gives to samples taken at the times (n,) [s].
 
     Jitter is normal. A sample that waits in a buffer gets the stamp of the one before it, with the
     probability `duplicated`. Stamps never run backwards and are whole microseconds.
-
-    Parameters
-    ----------
-    late : (n,) further delay of each sample [s].
     """
     noisy = t_s + jitter_s * normal(bits, len(t_s))[:, 0]
-    if late is not None:
-        noisy = noisy + late
     noisy = np.maximum.accumulate(np.maximum(np.rint(noisy * 1e6) * 1e-6, 0.0)) if len(noisy) else noisy
     twice = uniform(bits, len(t_s)) < duplicated
     if len(twice):

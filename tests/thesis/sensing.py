@@ -248,7 +248,7 @@ def cam_negligible() -> Values:
 
 
 def cam_no_closed_form() -> Values:
-    inverse = fit_inverse(CAMERA, 0.01)
+    inverse = fit_inverse(CAMERA)
     return {"coefficients": len(inverse.radial), "max_error_px": inverse.max_error_px}
 
 

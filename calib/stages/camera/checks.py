@@ -43,6 +43,8 @@ from calib.stages.camera.model import (
 # Where views show the board, which of them show it where others do, and how far the lens is one-to-one.
 
 _DIRECTIONS = 72
+_PER_SIDE = 9
+"""Pixels, with both corners, of each side of the picture's outline."""
 ONE_TO_ONE_REACH = 1.05
 """How far a lens has to be one-to-one, over the distance of the picture's farthest corner."""
 _MAX_PAIRED = 2000
@@ -157,15 +159,15 @@ def _same_place(apart: FloatArray, pixels: FloatArray, width_px: int) -> bool:
     return moved < float(np.clip(2 * noise, _SAME_PX, max(_SAME_SHARE * width_px, _SAME_PX)))
 
 
-def image_outline(camera: Camera, per_side: int = 9) -> FloatArray:
-    """Pixels (4 * (per_side - 1), 2) along the image's border, or nearer where only they show what is ahead.
+def image_outline(camera: Camera) -> FloatArray:
+    """Pixels (n, 2) along the image's border, or nearer where only they show what is ahead.
 
     The corners of a fisheye lens's picture often show nothing.
     """
     width, height = camera.image_size_px
-    u, v = np.linspace(0, width - 1, per_side), np.linspace(0, height - 1, per_side)
-    top = np.stack([u[:-1], np.zeros(per_side - 1)], axis=1)
-    right = np.stack([np.full(per_side - 1, width - 1.0), v[:-1]], axis=1)
+    u, v = np.linspace(0, width - 1, _PER_SIDE), np.linspace(0, height - 1, _PER_SIDE)
+    top = np.stack([u[:-1], np.zeros(_PER_SIDE - 1)], axis=1)
+    right = np.stack([np.full(_PER_SIDE - 1, width - 1.0), v[:-1]], axis=1)
     border = np.concatenate([top, right, [width - 1, height - 1] - top, [width - 1, height - 1] - right])
     if not camera.fisheye:
         return border

@@ -24,7 +24,7 @@ _MODEL = "radial2"
 _LITTLE = 1e-6
 
 
-def most_informative(views: Sequence[View], image_size_px: tuple[int, int], most: int = MOST) -> list[int]:
+def most_informative(views: Sequence[View], image_size_px: tuple[int, int]) -> list[int]:
     """Indices of the views to keep, in their own order; all where they are few or fit no camera."""
     every = list(range(len(views)))
     if len(views) <= _FEWEST:
@@ -44,7 +44,7 @@ def most_informative(views: Sequence[View], image_size_px: tuple[int, int], most
     total = _LITTLE * np.eye(G)
     place = repeated_views(packed, max(image_size_px))
     chosen: list[int] = []
-    while len(chosen) < min(most, len(np.unique(place))):
+    while len(chosen) < min(MOST, len(np.unique(place))):
         gain = np.linalg.slogdet(total + S)[1] - np.linalg.slogdet(total)[1]
         gain[np.isin(place, place[chosen])] = -np.inf
         best = int(np.argmax(gain))

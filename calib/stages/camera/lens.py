@@ -51,6 +51,7 @@ from calib.stages.camera.section import InverseLens, Lens
 
 _MOST_COEFFICIENTS, _MOST_STEPS = 10, 6
 _REWEIGHTINGS = 40
+_INVERSE_TOLERANCE_PX = 0.01
 _ROTATION_STEPS = 8
 _STEEPEST = float(np.tan(np.radians(75.0)))
 """Undistorted radius up to which a fisheye lens is undone: no polynomial follows the tangent to its pole at a
@@ -98,8 +99,8 @@ def _times_radial(radial: Sequence[float], x: AnyArray, y: AnyArray) -> tuple[An
     return x * P, y * P
 
 
-def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InverseLens:
-    """The shortest inverse polynomial within `tolerance_px` of the exact inverse, else the best found.
+def fit_inverse(camera: Camera) -> InverseLens:
+    """The shortest inverse polynomial within 0.01 px of the exact inverse, else the best found.
 
     Where the lens model folds over inside the picture, or bends more than ten
     coefficients can follow, the tolerance is not reached and `max_error_px` says by how much: the largest
@@ -131,12 +132,12 @@ def fit_inverse(camera: Camera, tolerance_px: float = 0.01) -> InverseLens:
             trial, error = checked(_minimax(camera, largest, count), most)
             if error < least:
                 best, least = trial, error
-            if least <= tolerance_px:
+            if least <= _INVERSE_TOLERANCE_PX:
                 break
         # Fewer steps where they do, and never more than help.
         for steps in range(most):
             trial, error = checked(best.radial, steps)
-            if error <= max(tolerance_px, 1.02 * least):
+            if error <= max(_INVERSE_TOLERANCE_PX, 1.02 * least):
                 return trial
     return best
 

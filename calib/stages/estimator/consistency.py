@@ -25,13 +25,14 @@ SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
 
 _INNOVATIONS = {"camera": ("e_u", "e_v"), "accel": ("e_ax", "e_ay"), "gyro": ("e_gz",)}
 SETTLED_S = 2.0
+_LEVEL = 0.95
 
 
-def chi_square_band(degrees: int, draws: int, level: float = 0.95) -> tuple[float, float]:
-    """Band in which the mean of `draws` chi-square numbers of `degrees` lies with probability `level`."""
+def chi_square_band(degrees: int, draws: int) -> tuple[float, float]:
+    """Band in which the mean of `draws` chi-square numbers of `degrees` lies with probability 95 %."""
     from scipy.special import chdtri
 
-    total, tail = degrees * max(draws, 1), 0.5 * (1.0 - level)
+    total, tail = degrees * max(draws, 1), 0.5 * (1.0 - _LEVEL)
     return float(chdtri(total, 1.0 - tail)) / max(draws, 1), float(chdtri(total, tail)) / max(draws, 1)
 
 
@@ -61,7 +62,6 @@ class Tally:
     start_s: float = math.nan
     end_s: float = math.nan
     scored: int = 0
-    log_likelihood: float = 0.0
     sensors: dict[str, FloatArray] = field(
         default_factory=lambda: {name: np.zeros(8) for name in (*SENSORS, "last")}
     )
@@ -79,7 +79,6 @@ class Tally:
         flags = out[:, OUT.index("flags")].astype(np.int64)
         for bit in (1, 2, 4, 8, 16, 32, 64):
             self.flags[bit] = self.flags.get(bit, 0) + int(np.count_nonzero(flags & bit))
-        self.log_likelihood += float(np.nansum(out[:, OUT.index("log_likelihood")]))
         late = out[:, 0] >= self.start_s + SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])

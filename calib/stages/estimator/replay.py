@@ -83,11 +83,11 @@ T = TypeVar("T")
 _DEPTH = 4
 
 
-def ahead(source: Iterable[T], depth: int = _DEPTH) -> Iterator[T]:
-    """The items of a source that another thread goes through, at most `depth` of them ahead."""
+def ahead(source: Iterable[T]) -> Iterator[T]:
+    """The items of a source that another thread goes through, a few of them ahead."""
     iterator = iter(source)
     with ThreadPoolExecutor(1) as pool:
-        waiting = deque(pool.submit(next, iterator, None) for _ in range(depth))
+        waiting = deque(pool.submit(next, iterator, None) for _ in range(_DEPTH))
         try:
             while (item := waiting.popleft().result()) is not None:
                 waiting.append(pool.submit(next, iterator, None))
@@ -98,7 +98,7 @@ def ahead(source: Iterable[T], depth: int = _DEPTH) -> Iterator[T]:
 
 
 @contextmanager
-def behind(finish: Callable[[T], None], depth: int = _DEPTH) -> Iterator[Callable[[T], None]]:
+def behind(finish: Callable[[T], None]) -> Iterator[Callable[[T], None]]:
     """A function that hands items to another thread, which finishes them in their order.
 
     All are finished when the block ends. An error in `finish` is raised by a later item or at the end.
@@ -107,7 +107,7 @@ def behind(finish: Callable[[T], None], depth: int = _DEPTH) -> Iterator[Callabl
     with ThreadPoolExecutor(1) as pool:
 
         def hand(item: T) -> None:
-            if len(waiting) >= depth:
+            if len(waiting) >= _DEPTH:
                 waiting.popleft().result()
             waiting.append(pool.submit(finish, item))
 
