@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 
 _MAX_ITERATIONS = 50
@@ -43,6 +43,11 @@ def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> Floa
     """Places (rows, columns, 2) spread evenly over a box (x0, y0, x1, y1), its borders included."""
     x0, y0, x1, y1 = box
     return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
+
+
+def in_picture(pixels: FloatArray, image_size_px: tuple[int, int]) -> BoolArray:
+    """Whether pixels (n, 2) are known and lie in a picture of this width and height, edges included, (n,)."""
+    return np.asarray(((pixels >= -0.5) & (pixels <= np.array(image_size_px) - 0.5)).all(axis=1))
 
 
 def apply_homography(H: FloatArray, points: FloatArray) -> FloatArray:

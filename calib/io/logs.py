@@ -31,6 +31,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, is_bag, shown, to_be
+from calib.core.geometry import in_picture
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
@@ -193,7 +194,7 @@ def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
     """
     rows = log.sampled(*_MARKER)
     at = np.stack([log.columns[name][rows] for name in _MARKER], axis=1) if len(rows) else np.zeros((0, 2))
-    outside = ~((at >= -0.5) & (at <= np.array(size_px) - 0.5)).all(axis=1)
+    outside = ~in_picture(at, size_px)
     if not outside.any():
         return log
     if outside.mean() > _MOST_OUTSIDE and len(np.unique(at[outside], axis=0)) > _SENTINELS:

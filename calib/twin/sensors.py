@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
+from calib.core.geometry import in_picture
 from calib.stages.actuator.dynamics import Coefficients
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w, forward, marker_from_head
 from calib.stages.actuator.simulate import derivative
@@ -276,9 +277,7 @@ def track(
     pixels = marker_pixels(view, tracker, q_m, bellows_radius_m) + noise.offset_px[frames]
     if tracker.grid_px > 0.0:
         pixels = tracker.grid_px * np.floor(pixels / tracker.grid_px + 0.5)
-    width, height = view.camera.image_size_px
-    outside = (pixels < -0.5) | (pixels > np.array([width - 0.5, height - 0.5])) | np.isnan(pixels)
-    gone = noise.missing[frames] | outside.any(axis=-1)
+    gone = noise.missing[frames] | ~in_picture(pixels, view.camera.image_size_px)
     return np.where(gone[:, None], np.nan, pixels)
 
 

@@ -10,7 +10,14 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import Homography, apply_homography, box_grid, fit_homography, map_jacobian
+from calib.core.geometry import (
+    Homography,
+    apply_homography,
+    box_grid,
+    fit_homography,
+    in_picture,
+    map_jacobian,
+)
 from calib.core.verdict import Finding, Verdict
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.model import Board, Camera, View, project, undistort
@@ -71,7 +78,7 @@ class PositionSigma:
 def visible(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, points_m: FloatArray) -> BoolArray:
     """Which places (N, 2) of the plane the picture shows, (N,): in front, inside, and not folded over."""
     pixels = plane_pixels(camera, R_CW, t_CW_m, points_m)
-    shown = np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size_px) - 0.5), axis=1))
+    shown = in_picture(pixels, camera.image_size_px)
     back = plane_map(camera, R_CW, t_CW_m, pixels[shown])
     shown[shown] = np.linalg.norm(back - points_m[shown], axis=1) < 1e-6 * np.linalg.norm(t_CW_m)
     return shown

@@ -21,7 +21,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.core.geometry import box_grid, fit_homography
+from calib.core.geometry import box_grid, fit_homography, in_picture
 from calib.io.states import BASELINE
 from calib.stages.actuator.kinematics import inverse_coefficients
 from calib.stages.estimator.kinematic import Rows
@@ -74,9 +74,7 @@ def undistorting_nothing(
         # A head of no length at the origin, seen at a shifted place.
         state[14:16] = place
         pixels[i] = marker(view, state, by[0], by[1])
-    width, height = image_size_px
-    inside = np.isfinite(pixels).all(axis=1) & (pixels >= -0.5).all(axis=1)
-    inside &= (pixels <= np.array([width - 0.5, height - 0.5])).all(axis=1)
+    inside = in_picture(pixels, image_size_px)
     if inside.sum() < 12:
         raise BadInputError("plane: the camera does not see the workspace")
     H = fit_homography(world[inside], pixels[inside]).H

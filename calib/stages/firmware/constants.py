@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import box_grid, fit_homography
+from calib.core.geometry import box_grid, fit_homography, in_picture
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficients
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
@@ -143,8 +143,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     if not depth.min() > 0.0:
         raise BadInputError("plane: the workspace reaches behind the camera, so no marker can be mapped")
     pixels = project(camera, grid @ R[:, :2].T + t)
-    width, height = camera.image_size_px
-    inside = ((pixels >= -0.5) & (pixels <= np.array([width - 0.5, height - 0.5]))).all(axis=1)
+    inside = in_picture(pixels, camera.image_size_px)
     raw, raw_least, error = None, 0.0, 0.0
     if inside.sum() >= 12:
         H = fit_homography(grid[inside], pixels[inside]).H
