@@ -140,7 +140,7 @@ def track(
     told: dict[str, Any] = {
         "frames": len(found),
         "found": seen,
-        "lost": tracker.lost,
+        "lost": len(found) - seen,
         "doubled": tracker.doubled,
         "elsewhere_s": [float(at_s[k]) for k in tracker.elsewhere],
         "sigma_px": sorted(row[3] for row in rows)[len(rows) // 2],
@@ -149,7 +149,7 @@ def track(
     if as_json:
         document("track", {"track": told})
     else:
-        say(f"marker in {seen} of {len(found)} frames, written to {shown(output)}; {tracker.lost} lost")
+        say(f"marker in {seen} of {len(found)} frames, written to {shown(output)}; {len(found) - seen} lost")
         if tracker.doubled:
             say(f"another disc of its colour in {tracker.doubled} frames")
         if tracker.elsewhere:

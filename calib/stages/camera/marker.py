@@ -86,6 +86,9 @@ _GROWTH, _GROWTH_PX, _GROWTH_LOST = 0.15, 1.0, 0.005
 half a disc looks like one of three quarters of its radius."""
 _JUMP_RADII = 4.0
 """Radii from where it is expected within which a disc is the marker from one frame to the next."""
+_NEARER, _SLACK_RADII = 2.0, 0.5
+"""How many times nearer to one disc's way than to another's a disc has to be to be told apart, and radii that
+noise may add."""
 
 
 @dataclass(frozen=True)
@@ -496,7 +499,7 @@ class Tracker:
     Attributes
     ----------
     colour : of the marker. start_px : where it is in the first frame; None to take the only disc.
-    frames, lost, doubled : frames in all, without the marker, and with another disc of its colour.
+    frames, doubled : frames in all, and with another disc of its colour.
     first : the discs of the first frame.
     elsewhere : the frames from which on a disc far from where the marker was lost is followed.
     taken_back : how many frames before the last one have lost their disc with it.
@@ -505,7 +508,6 @@ class Tracker:
     colour: Colour
     start_px: tuple[float, float] | None = None
     frames: int = 0
-    lost: int = 0
     doubled: int = 0
     first: list[Disc] = field(default_factory=list)
     elsewhere: list[int] = field(default_factory=list)
@@ -535,9 +537,7 @@ class Tracker:
             self._marker = None if one is None else _Path(one)
         else:
             one = self._next(self._marker, found, bgr.shape)
-        if one is None:
-            self.lost += 1
-        elif self._before is not None:
+        if one is not None and self._before is not None:
             self._far += 1
             if self._far > _FORGOTTEN_FRAMES:
                 self._before = None
@@ -556,7 +556,7 @@ class Tracker:
 
     def begin(self) -> None:
         """Count from the next frame on."""
-        self.frames = self.lost = self.doubled = 0
+        self.frames = self.doubled = 0
         self.elsewhere, self._before = [], None
 
     def _first(self, found: list[Disc]) -> Disc | None:
@@ -584,7 +584,7 @@ class Tracker:
             near, *rest = sorted(free, key=marker.away)
         away = marker.away(near)
         lost = marker.since > _AGAIN_FRAMES
-        clearly = not rest or (marker.away(rest[0]) > 2 * away + 1.0 and not (lost and away > 1.0))
+        clearly = not rest or (marker.away(rest[0]) > _NEARER * away + 1.0 and not (lost and away > 1.0))
         if not clearly or self._another(marker, near, found):
             return None
         # The only disc of which it is not known that it is another one is the marker, wherever it went.
@@ -608,12 +608,12 @@ class Tracker:
             if not path.alike(one) or any(path.away(other) < min(apart, path.reach) for other in found):
                 continue
             if surely:
-                if apart < path.reach and 2 * apart < away:
+                if apart < path.reach and _NEARER * apart < away:
                     return True
             elif in_touch and path.since > _AGAIN_FRAMES and away < marker.reach:
                 # It has been gone for long, and the marker goes on as expected.
                 continue
-            elif apart < (path.reach if in_touch else path.longest) and apart < 2 * away + 0.5:
+            elif apart < (path.reach if in_touch else path.longest) and apart < _NEARER * away + _SLACK_RADII:
                 return True
         return False
 
@@ -625,7 +625,6 @@ class Tracker:
     def _give_up(self, before: _Path) -> _Path:
         """Give up the disc that is followed for the path before it."""
         self.taken_back = self.frames - 1 - self._far_from
-        self.lost += self._far
         self.elsewhere = [frame for frame in self.elsewhere if frame < self._far_from]
         self._before, self._others = None, []
         return before
