@@ -22,6 +22,7 @@ from calib.stages.imu.mahony import Mahony, mean_angle, wrapped
 from calib.stages.imu.sampling import (
     Readings,
     Sampling,
+    over_logs,
     regular_parts,
     rest_parts,
     sampled,
@@ -420,12 +421,7 @@ def spread_of(logs: Sequence[DriftOfLog]) -> dict[str, DriftSlopes]:
     out = {}
     for name in dict.fromkeys(name for log in logs for name in log.methods):
         slopes = [log.methods[name].slope_degps for log in logs if name in log.methods]
-        known = np.array([slope for slope in slopes if slope is not None])
-        out[name] = DriftSlopes(
-            mean_degps=float(known.mean()) if len(known) else None,
-            spread_degps=float(known.std(ddof=1)) if len(known) > 1 else None,
-            logs=len(known),
-        )
+        out[name] = DriftSlopes(**over_logs([slope for slope in slopes if slope is not None]))
     return out
 
 

@@ -79,7 +79,7 @@ class Sampling:
     jitter_s : robust standard deviation of the time stamps about the samples' times.
     steady : whether the sensor samples at even steps.
     repeated_rows, repeated_stamps : rows dropped, and stamps that occur again with other readings.
-    gaps : in order of time.
+    gaps : in order of time. missing : samples in those that were filled.
     step : (axes,) quantisation step in the axis's unit, NaN where none is seen.
     at_limit : (axes,) readings at the end of a usual range, several in a row.
     dropped : share of the samples that a sensor which is not steady seems to lack.
@@ -94,14 +94,10 @@ class Sampling:
     repeated_rows: int
     repeated_stamps: int
     gaps: tuple[Gap, ...]
+    missing: int
     step: FloatArray
     at_limit: IntArray
     dropped: float = 0.0
-
-    @property
-    def missing(self) -> int:
-        """Samples missing in gaps that were filled."""
-        return sum(gap.missing for gap in self.gaps if not gap.split)
 
 
 _MOST_MISSING = 0.02
@@ -241,6 +237,7 @@ def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
         repeated_rows=log.repeated_rows,
         repeated_stamps=axis.repeated,
         gaps=axis.gaps,
+        missing=axis.missing,
         step=np.array([_step(column) for column in values.T]),
         dropped=0.0 if axis.steady else _dropped(t_s),
         at_limit=np.array(
@@ -499,6 +496,15 @@ def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold
             scatter = _scatter(values, s.period_s)
             rests.append(Rest(number, start, stop, from_s, to_s, values.mean(axis=0), scatter))
     return tuple(rests)
+
+
+def over_logs(slopes_degps: Sequence[float]) -> dict[str, Any]:
+    """Keys of the slopes of an angle, one for each log that shows one (Fig. 2.4): mean and scatter."""
+    return {
+        "mean_degps": float(np.mean(slopes_degps)) if slopes_degps else None,
+        "spread_degps": float(np.std(slopes_degps, ddof=1)) if len(slopes_degps) > 1 else None,
+        "logs": len(slopes_degps),
+    }
 
 
 def sampled(s: Sampling) -> dict[str, Any]:

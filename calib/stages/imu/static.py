@@ -20,6 +20,7 @@ from calib.stages.imu.sampling import (
     Readings,
     Sampling,
     check_rate,
+    over_logs,
     regular_parts,
     rest_parts,
     rounding,
@@ -548,15 +549,7 @@ def solve_static(logs: Sequence[Readings]) -> Imu:
             **values,
             "sigma": {key: row for key, row in sigma.items() if row != [None] * 3},
             "below": {key: row for key, row in below.items() if row != [None] * 3},
-            "drift": {
-                name: {
-                    "mean_degps": float(np.mean(slopes)),
-                    "spread_degps": float(np.std(slopes, ddof=1)) if len(slopes) > 1 else None,
-                    "logs": len(slopes),
-                }
-                for name, slopes in drift.items()
-                if slopes
-            },
+            "drift": {name: over_logs(slopes) for name, slopes in drift.items() if slopes},
             "logs": [_rest_log(log) for log in result.logs],
             **judged(Verdict.of([*judge(result).findings, *sensor_findings(logs)])),
         }
