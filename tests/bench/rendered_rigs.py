@@ -1,7 +1,7 @@
 """The estimator on rigs that are rendered, calibrated and aligned with the project's own commands.
 
     python tests/bench/rendered_rigs.py [FIRST_SEED] [COUNT] [--keep FOLDER] [--undrawn] [--off MM]
-                                         [--wrong KIND]
+                                         [--raised] [--wrong KIND]
 
 Of each rig lens, plane, latency (10 to 40 ms), mount, IMU's place, noise, biases, plant and pumps (up to 8 %
 off) and the asymmetry of the pumps are drawn by its seed. Its folder is made as `calib simulate rig` does;
@@ -10,7 +10,7 @@ then once more after `calib identify` on the logs that were aligned. Nothing is 
 errors. `--keep` leaves the calibrated folders for another run, which replays only.
 
 The marker sits where its drawing says, or off from there with the deviation `--off`, which rig.yaml then
-states, as one states what a caliper tells; then it also moves nearer to the camera than the board lay, or
+states, as one states what a caliper tells. `--raised` moves it nearer to the camera than the board lay, or
 farther from it, by a share with the deviation that `align` expects of the plane's stretch. `--undrawn` says
 in rig.yaml that the drawing is good to 3 mm, so that the logs have to find the marker. `--wrong` makes the
 rigs in a way that the model does not know (`WRONG`); with `--keep` they take the pictures of the right rig.
@@ -153,7 +153,7 @@ def _log(
     return log_text(log_of(run))
 
 
-def make(folder: Path, seed: int, off_mm: float, wrong: str | None, pictures: Path) -> None:
+def make(folder: Path, seed: int, off_mm: float, raised: bool, wrong: str | None, pictures: Path) -> None:
     """A rig's folder as `calib simulate rig` makes it, and the logs that are replayed."""
     rig = drawn(seed, off_mm, wrong)
     if wrong and pictures.exists():
@@ -161,9 +161,9 @@ def make(folder: Path, seed: int, off_mm: float, wrong: str | None, pictures: Pa
         (folder / "logs").mkdir()
     else:
         write_rig_folder(folder, rig, seed)
-    if off_mm:
+    if raised:
         rig = above_board(rig, seed)
-    if wrong or off_mm:
+    if wrong or raised:
         for k, name in enumerate((*RESTS, *ALIGNED)):
             text = _log(rig, *LOGS[name], 1000 * seed + k, None, wrong == "hysteresis")
             (folder / "logs" / f"{name}.csv").write_text(text)
@@ -305,6 +305,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--undrawn", action="store_true")
     parser.add_argument("--off", type=float, default=0.0)
+    parser.add_argument("--raised", action="store_true")
     parser.add_argument("--wrong", choices=WRONG)
     given = parser.parse_args()
     results: dict[str, dict[str, list[Replayed]]] = {way: {name: [] for name in REPLAYED} for way in WAYS}
@@ -317,7 +318,7 @@ def main() -> None:
             folder = root / f"rig{seed}_{given.wrong.replace(' ', '_')}" if given.wrong else right
             said = "kept"
             if not (folder / "replayed").exists():
-                make(folder, seed, given.off, given.wrong, right / "images")
+                make(folder, seed, given.off, given.raised, given.wrong, right / "images")
             if not (folder / "identified.yaml").exists():
                 said = calibrate(folder, given.undrawn, given.off)
             true = drawn(seed, given.off, given.wrong)
