@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log, unclipped
 from calib.stages.align.join import joined
+from calib.stages.align.plots import plots
 from calib.stages.align.read import settings_from_rig
+from calib.stages.align.section import Align
 from calib.stages.align.solve import (
     AlignLog,
     Alignment,
@@ -77,6 +81,8 @@ def test_swing_and_ellipse_align_a_rig() -> None:
         after, before = trace.imu_after[:, 1], trace.imu_before[:, 1]
         assert np.nanstd(after) < 0.03
         assert abs(np.nanmean(before)) > 5.0 * abs(np.nanmean(after))
+    figures = plots(cast("Align", SimpleNamespace(evidence=found, verdict=judge(found))))
+    assert list(figures) == ["align_correlation", "align_residuals_1", "align_residuals_2"]
 
 
 @pytest.mark.parametrize("pace", [0.0, 0.003, -0.01])

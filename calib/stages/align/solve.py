@@ -948,13 +948,14 @@ class Trace:
 
     Attributes
     ----------
-    log : number. camera_s, imu_s : times. good : (n,). camera_after : (n, 2) [px].
+    log : number. camera_s, imu_s : times. good : (n,). camera_before, camera_after : (n, 2) [px].
     imu_before, imu_after : (m, 3).
     """
 
     log: int
     camera_s: FloatArray
     good: FloatArray
+    camera_before: FloatArray
     camera_after: FloatArray
     imu_s: FloatArray
     imu_before: FloatArray
@@ -1159,7 +1160,7 @@ def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
     return tuple(
         Trace(
             stretch.log, stretch.camera_s, good,
-            pictures_off(problem, stretch, c, fit.sensor),
+            pictures_off(problem, stretch, c, first), pictures_off(problem, stretch, c, fit.sensor),
             stretch.imu_s,
             readings_off(stretch, c, first), readings_off(stretch, c, fit.sensor),
         )
