@@ -175,7 +175,8 @@ def _answer(verb: str, logs: list[Log], rig: Rig, folder: Path) -> Answer:
         }[verb]()
     except CalibError as error:
         return Answer(f"refused: {error}", {})
-    sections = made if isinstance(made, tuple) else (made,)
+    # There is no section of pumps where the log with commands was left out.
+    sections = [one for one in made if one is not None] if isinstance(made, tuple) else [made]
     return Answer(calib.core.verdict.worst(one.verdict.word for one in sections), _values(*sections))
 
 

@@ -1060,8 +1060,20 @@ def _alike(cost: float) -> float:
 # (Newey and West) holds, with lags L of a third of a second or, where residuals stay alike for longer, up to
 # the first at which they do not. It scatters itself, so of it and the white one the larger variance is taken
 # for each parameter; their ratio says how far colour has inflated it.
+#
+# Both hold for a model that is right in the mean. One of another structure, as of a rig with dry friction or
+# hysteresis, fits each stretch of a log with other parameters. With the information H_s and the gradient g_s
+# of a stretch, parameter i of it alone is off by d = -g_s,i / h, h = (H_s - H_s H^-1 H_s)_ii, all others
+# following, with the variance 1 / h, raised as above. Where these scatter by more, their variance T_i
+# between stretches (DerSimonian and Laird) is added: that of another stretch, and that of the fit,
+#
+#     T + sum_s sum_i T_i (H^-1 H_s e_i) (H^-1 H_s e_i)^T.
 
 _SPAN_S, _LONGEST_S = 0.35, 10.0
+_STRETCHES = 5
+"""Of each log: a swing that has died away within two thirds of its log is told in three."""
+_SCATTERS = 0.01
+"""Probability of such a scatter by chance, below which it is believed."""
 _LAGS = 20
 _BAND = 1.96
 """Of the correlation of white residuals, over the root of their number."""
@@ -1073,12 +1085,15 @@ class Uncertainty:
 
     Attributes
     ----------
-    sigma : by name. inflation : by name, how much colour has raised it. covariance, correlation : (P, P).
+    sigma : by name. covariance, correlation : (P, P).
+    inflation : by name, how much colour has raised it. scatter : by name, how much on top of that has what
+    stretches of the logs disagree on.
     scale : robust standard deviation of the whitened residuals, 1 for a perfect model and noise.
     """
 
     sigma: dict[str, float]
     inflation: dict[str, float]
+    scatter: dict[str, float]
     covariance: FloatArray
     correlation: FloatArray
     scale: float
@@ -1160,16 +1175,62 @@ def uncertainty(solution: Solution) -> Uncertainty:
     spread = float(np.mean((w * r**2)[:rows])) / scale**2
     white = inverse[:P, :P] * max(spread, 1.0)
     ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(white), 1e-300), 1.0))
-    covariance = white * np.outer(ratio, ratio)
+    coloured = white * np.outer(ratio, ratio)
+    between = _between(solution, w * size, inverse, ratio)
+    covariance = coloured + between
+    scatter = np.sqrt(1.0 + np.diag(between) / np.maximum(np.diag(coloured), 1e-300))
     # What moves no residual at all is not known exactly, but not at all.
     sigma = np.where(np.diag(H)[:P] > 0.0, np.sqrt(np.diag(covariance)), np.inf)
     return Uncertainty(
         dict(zip(problem.names, sigma.tolist(), strict=True)),
         dict(zip(problem.names, ratio.tolist(), strict=True)),
+        dict(zip(problem.names, scatter.tolist(), strict=True)),
         covariance,
         covariance / np.outer(sigma, sigma),
         scale,
     )
+
+
+def _between(solution: Solution, w: FloatArray, inverse: FloatArray, raised: FloatArray) -> FloatArray:
+    """Covariance (P, P) of the parameters by what stretches of the logs disagree on.
+
+    Parameters
+    ----------
+    w : (rows,) weights of the residuals. inverse : H^-1 of all unknowns.
+    raised : (P,) by how much colour raises deviations.
+    """
+    from scipy.special import chdtrc
+
+    problem, P = solution.problem, len(solution.problem.names)
+    matrices, slopes = [], []
+    for track, span in zip(problem.tracks, problem.spans, strict=True):
+        J, r, some = solution.J[span], solution.residual[span], w[span]
+        ends = np.linspace(track.t_s[0], track.t_s[-1], _STRETCHES + 1)[1:-1]
+        stretch = np.repeat(np.searchsorted(ends, track.t_s, side="right"), 2)
+        for k in range(_STRETCHES):
+            rows = stretch == k
+            WJ = J[rows] * some[rows, None]
+            matrices.append(WJ.T @ J[rows])
+            slopes.append(WJ.T @ r[rows])
+    H, g = np.array(matrices), np.array(slopes)
+    whole = np.einsum("sii->si", H)[:, :P]
+    by = np.einsum("ij,sjp->sip", inverse, H[:, :, :P])
+    own = whole - np.einsum("sip,sip->sp", H[:, :, :P], by)
+    pull = g[:, :P] - np.einsum("sip,i->sp", by, g.sum(axis=0))
+    out = np.zeros((P, P))
+    for i in range(P):
+        told = own[:, i] > 1e-6 * np.maximum(whole[:, i], 1e-300)
+        count, h = int(told.sum()), own[told, i] / raised[i] ** 2
+        if count < 2:
+            continue
+        Q = float(np.sum((pull[told, i] / own[told, i]) ** 2 * h))
+        if chdtrc(count, Q) > _SCATTERS:
+            continue
+        # What is the same in all runs cannot be further off than a person states.
+        T = min((Q - count) / (h.sum() - np.sum(h**2) / h.sum()), problem.unknowns.sigma[i] ** 2)
+        out[i, i] += T
+        out += T * by[:, :P, i].T @ by[:, :P, i]
+    return out
 
 
 def colour_of(solution: Solution) -> tuple[Colour, ...]:
@@ -1715,6 +1776,9 @@ _MOST_SCALE = 2.5
 _MOST_INFLATION = 8.0
 _MOST_HELD, _LEAST_CHANCE = 1.5, 0.01
 _MOST_RELATIVE = 0.25
+_MOST_SCATTER = 1.5
+_SLOW = 1.5
+"""Periods of a loop for which a log's commands stand, beyond which it may have sent others in between."""
 _STRONG = 0.95
 _FAR_ROWS = 0.05
 _MOST_APART_S = 0.04
@@ -1752,12 +1816,23 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
             f"the residuals are so coloured that the deviation of {label_of(worst)} had to be raised "
             f"{known.inflation[worst]:.1f} times"
         )
+    loop_s = solution.problem.nominal.pump.tick_s
+    slow = {
+        track.name: track.tick_s
+        for track in solution.problem.tracks
+        if track.hoses and track.tick_s > _SLOW * loop_s
+    }
     for colour in colours:
         if not colour.white:
             remark(
                 f"{colour.name}: residuals are not white ({100.0 * colour.outside:.0f} % of the lags outside "
                 f"the 95 % band, {max(colour.first, key=abs):+.2f} from row to row); deviations are raised"
             )
+        if colour.name in slow and not colour.white:
+            every = f"{1e3 * slow[colour.name]:.3g} ms"
+            text = f"{colour.name}: its commands come every {every}; what the pumps got in between is missing"
+            advice = "write each command into the log when it is sent, or state known: {pump: {tick_s: ...}}"
+            out.append(Finding("remark", text, advice))
         if colour.share_far > _FAR_ROWS:
             poor(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
     labels = [label_of(name) for name in solution.problem.names]
@@ -1936,6 +2011,9 @@ def judge(
             so = f"known to {100.0 * relative:.0f} % only"
             if relative > 1.0:
                 so = f"{value:.3g} +- {known.sigma[name]:.2g}: these logs do not tell it from zero"
+            if known.scatter[name] > _MOST_SCATTER:
+                times = f"{known.scatter[name]:.1f} times"
+                so += f"; stretches of the logs disagree on it, which raised its deviation {times}"
             out.append(Finding("poor", f"{label_of(name)} is {so}"))
     out += [*_of_fit(solution, known, colours), *_apart(solution, known)]
     for log in held:

@@ -282,6 +282,7 @@ def identified_json(found: Identified) -> dict[str, Any]:
                 "unit": PARAMETERS[name].unit,
                 "symbol": PARAMETERS[name].symbol,
                 "inflation": u.inflation[name],
+                "scatter": u.scatter[name],
             }
             for name, value in s.values.items()
         },

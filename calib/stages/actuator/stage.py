@@ -115,13 +115,13 @@ def _words(sections: Sections) -> list[Block]:
             f"{known.sigma[name]:.2g}",
             PARAMETERS[name].unit or BLANK,
             PARAMETERS[name].symbol,
-            f"{known.inflation[name]:.1f}",
+            f"{known.inflation[name] * known.scatter[name]:.1f}",
         )
         for name, value in solution.values.items()
     ]
     blocks: list[Block] = [
         Table(("parameter", "value", "sigma", "unit", "symbol", "raised"), tuple(rows)),
-        Line("sigma is one standard deviation; raised, by how much for coloured residuals"),
+        Line("sigma is one standard deviation; raised, by how much for colour and disagreement"),
     ]
     names = solution.problem.names
     if len(names) > 1:
