@@ -18,6 +18,7 @@ columns.yaml lies beside the logs; `NAME.columns.yaml` goes before it for one of
     t_s: {column: millis, unit: ms}                 of one column: its name in the file, its unit,
     gz_radps: {column: gyro_z, factor: -1}          and SI = (cell - offset) * factor * unit
     ax_mps2: {column: raw_x, unit: counts, factor: 0.0024, offset: 32768}
+    rate_hz: 100                                    of rows without a time, one after the other
     separator: ";"
     decimal: ","
 """
@@ -102,12 +103,17 @@ _SPELLED = {
 }  # fmt: skip
 _UNIT = {word: unit for unit, words in _SPELLED.items() for word in words.split()}
 
-_AXIS = re.compile(
-    r"(?:(?P<accel>a|acc|accel|accelerometer|acceleration|linearacceleration|specificforce)"
-    r"|(?P<gyro>g|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate))(?:rss)?(?P<axis>[xyz])"
-)
-_TIME = re.compile(r"t|ts|time|datetime|timestamp|timestamps|stamp|clock|elapsed|headerstamp")
-_NAMED_BY_UNIT = {"millis": "ms", "micros": "us", "nanos": "ns", "seconds": "s", "secs": "s", "ms": "ms"}
+_ACCEL = r"(?P<accel>a|ac|acc|accl|accel|accelerometer|acceleration|linearacceleration|specificforce)"
+_GYRO = r"(?P<gyro>g|gy|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate)"
+_AXIS = re.compile(rf"(?:{_ACCEL}|{_GYRO})(?:rss)?(?P<axis>[xyz])")
+_AXIS_FIRST = re.compile(r"(?P<axis>[xyz])(?:(?P<accel>accl?|accel)|gyro)")
+_TIME = re.compile(r"t|ts|time|timeboot|datetime|timestamp|timestamps|stamp|clock|elapsed|headerstamp")
+_NAMED_BY_UNIT = {
+    "millis": "ms", "micros": "us", "nanos": "ns", "ms": "ms",
+    "seconds": "s", "secs": "s", "secondselapsed": "s",
+}  # fmt: skip
+_COUNTS = re.compile(r"(?:sample|packet|row|line|frame)?(?:counter|count|number|index|idx|no)")
+"""A name of what counts samples."""
 _PIXEL = re.compile(r"(?:pixel|px|marker|cam|camera|image|img|blob|pixy)?(?P<axis>[uv])")
 _PIXEL_XY = re.compile(r"(?:pixel|px|marker|blob|pixy)(?P<axis>[xy])")
 _PWM = re.compile(r"(?:pwm|duty|valve|cmd|command|pump)(?P<number>[12])")
@@ -116,7 +122,7 @@ _POSE = re.compile(r"(?P<of>base|tip)(?P<axis>[xyz])|tip(?P<phi>phi|angle)")
 _CHIP = re.compile(r"(?:onchip|chip|fused|fusion)(?:phi|angle)")
 _DEVICES = ("imu", "bno055", "bno", "mpu6050", "mpu", "sensor", "field", "data", "msg")
 
-_RESERVED = ("names", "units", "separator", "decimal")
+_RESERVED = ("names", "units", "rate_hz", "separator", "decimal")
 _RATES_HZ = (4.0, 4000.0)
 _SLOWEST_S, _FASTEST_S = 0.9, 2e-5
 """Steps of a stated unit that are refused: no camera and no IMU samples once a second or at 50 kHz."""
@@ -197,7 +203,7 @@ def known_name(name: str) -> tuple[str, str] | None:
 def _column(word: str, unit: str) -> tuple[str, str] | None:
     """The column of a bare name, where the unit is one of its kind."""
     column = ""
-    if axis := _AXIS.fullmatch(word):
+    if axis := _AXIS.fullmatch(word) or _AXIS_FIRST.fullmatch(word):
         column = f"a{axis['axis']}_mps2" if axis["accel"] else f"g{axis['axis']}_radps"
     elif _TIME.fullmatch(word):
         column = "t_s"
@@ -323,12 +329,16 @@ class Source:
 
 @dataclass(frozen=True)
 class ColumnsFile:
-    """A columns.yaml: sources by column, units by kind, names for want of a header, and the text's marks."""
+    """A columns.yaml: sources by column, units by kind, names for want of a header, and the text's marks.
+
+    `rate_hz` is that of rows without a time, 0 where it does not say.
+    """
 
     path: Path
     sources: Mapping[str, Source]
     units: Mapping[str, str]
     names: tuple[str, ...] = ()
+    rate_hz: float = 0.0
     separator: str = ""
     decimal: str = ""
 
@@ -364,14 +374,18 @@ def read_columns_file(path: Path) -> ColumnsFile:
         if kind not in UNITS or not isinstance(unit, str) or unit not in UNITS[kind]:
             expected = ", ".join(UNITS.get(kind, UNITS))
             raise BadInputError(f"{where}: units.{_word(kind)} is {quoted(unit)}, expected one of {expected}")
+    rate = document.get("rate_hz", 0.0)
+    number = isinstance(rate, int | float) and not isinstance(rate, bool)
+    if "rate_hz" in document and not (number and 0.0 < rate < math.inf):
+        raise BadInputError(f"{where}: rate_hz is {quoted(rate)}, expected rows a second, such as 100")
     marks = {}
-    for key, known in (("separator", (",", ";", "\t")), ("decimal", (".", ","))):
+    for key, known in (("separator", (",", ";", "\t", " ")), ("decimal", (".", ","))):
         marks[key] = document.get(key, "")
         if marks[key] and marks[key] not in known:
             raise BadInputError(f"{where}: {key} is {quoted(marks[key])}, expected one of {known}")
     columns = [key for key in document if key not in _RESERVED]
     sources = {key: _source(f"{where}: {key}", key, document[key]) for key in columns}
-    return ColumnsFile(path, sources, units, tuple(names), marks["separator"], marks["decimal"])
+    return ColumnsFile(path, sources, units, tuple(names), float(rate), marks["separator"], marks["decimal"])
 
 
 def _source(where: str, column: str, entry: Any) -> Source:
@@ -411,6 +425,7 @@ class ColumnMap:
     names : of the file's columns. sources : by column, `t_s` among them.
     evidence : for each kind whose unit the readings tell, how.
     above : where the table begins, in words, if something else stands above it.
+    rate_hz : of the rows where the number of each is its time, which then comes from no column; else 0.
     """
 
     source: str
@@ -419,12 +434,18 @@ class ColumnMap:
     sources: Mapping[str, Source]
     evidence: Mapping[str, str]
     above: str = ""
+    rate_hz: float = 0.0
+
+    @property
+    def read(self) -> dict[str, str]:
+        """Name in the file of each column that is read."""
+        return {name: source.column for name, source in self.sources.items() if source.column}
 
     @property
     def unknown(self) -> tuple[str, ...]:
         """Names of the file's columns that are not read."""
-        read = {source.column for source in self.sources.values()}
-        return tuple(name for name in self.names if name not in read)
+        read = self.read.values()
+        return tuple(name for name in self.names if name and name not in read)
 
     @property
     def narration(self) -> str:
@@ -432,6 +453,8 @@ class ColumnMap:
         words = {"time": "time", "accel": "accelerations", "gyro": "rates", "angle": "the chip's angle"}
         groups: dict[tuple[str, str], list[str]] = {}
         for column, source in self.sources.items():
+            if not source.column:
+                continue
             kind = kind_of(column)
             own = next(iter(UNITS.get(kind, {"": 1.0})))
             what = column if column in POSE else words.get(kind, column)
@@ -439,6 +462,8 @@ class ColumnMap:
                 in_unit = f" in {source.unit}" if kind in words else ""
                 groups.setdefault((kind, f"{what}{in_unit}"), []).append(source.column)
         parts = [self.above] if self.above else []
+        if self.rate_hz:
+            parts.append(f"times counted in rows at {self.rate_hz:g} Hz, so that none may be missing")
         for (kind, what), columns in groups.items():
             why = f" ({self.evidence[kind]})" if kind in self.evidence else ""
             parts.append(f"{what} from {', '.join(f'`{one_line(name)[:40]}`' for name in columns)}{why}")
@@ -446,8 +471,10 @@ class ColumnMap:
 
     def text(self) -> str:
         """A columns.yaml that says the same."""
-        lines = []
+        lines = [f"rate_hz: {self.rate_hz!r}\n"] if self.rate_hz else []
         for column, source in self.sources.items():
+            if not source.column:
+                continue
             entry = [f"column: {_yaml(source.column)}"]
             entry += [f"unit: {source.unit}"] if kind_of(column) else []
             entry += [f"factor: {source.factor!r}"] if source.factor != 1.0 else []
@@ -458,7 +485,7 @@ class ColumnMap:
 
 def _is_written(path: Path) -> bool:
     lines = head(path).splitlines()
-    return all(re.fullmatch(rb"[a-z0-9_]+: \{column: .+\}", line) for line in lines)
+    return all(re.fullmatch(rb"[a-z0-9_]+: \{column: .+\}|rate_hz: .+", line) for line in lines)
 
 
 COLUMNS_FILE = Kind("a columns.yaml", (".yaml", ".yml"), _is_written)
@@ -513,11 +540,22 @@ def column_map(
         if candidates:
             name, unit = candidates[0]
             sources[column] = Source(name, unit, "name" if unit else "")
+    rate_hz = file.rate_hz if file else 0.0
+    if rate_hz and "t_s" in sources:
+        raise BadInputError(
+            f"{where}: has the time `{one_line(sources['t_s'].column)[:40]}`, and {add} says rate_hz, which "
+            "is for rows without; leave it out"
+        )
+    if rate_hz:
+        sources = {"t_s": Source("", "s", "file"), **sources}
     if "t_s" not in sources:
         listed = one_line(", ".join(names[:6]) + (", ..." if len(names) > 6 else ""))[:200]
+        count = next((n for n in names if _COUNTS.fullmatch(re.sub(r"[\W_]", "", n).lower())), "")
+        counted = f"; if {_yaml(count)} counts samples, t_s: {{column: {_yaml(count)}, factor: PERIOD_S}}"
         raise BadInputError(
             f"{where}: has no column t_s, found {listed!r}; if one of them is the time, add to {add} "
-            "the line t_s: {column: NAME, unit: s}"
+            f"the line t_s: {{column: NAME, unit: s}}{counted if count else ''}; if every row is one sample "
+            "and none is missing, rate_hz: RATE"
         )
     for column, given in sources.items():
         kind = kind_of(column)
@@ -528,7 +566,7 @@ def column_map(
             sources[column] = replace(given, unit=file.units[kind], stated="file")
         elif not given.unit and given.factor != 1.0:
             sources[column] = replace(given, unit=next(iter(UNITS[kind])), stated="file")
-    return ColumnMap(source, add, names, sources, {})
+    return ColumnMap(source, add, names, sources, {}, rate_hz=rate_hz)
 
 
 def _named(names: tuple[str, ...], column: str) -> str | None:

@@ -10,7 +10,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -55,7 +55,7 @@ class _Text:
     @property
     def slots(self) -> dict[str, int]:
         """Number of each column that is read, in the file."""
-        return {name: self.columns.names.index(one.column) for name, one in self.columns.sources.items()}
+        return {name: self.columns.names.index(column) for name, column in self.columns.read.items()}
 
 
 def _number(text: _Text, word: str, column: str, line: int) -> float:
@@ -96,7 +96,7 @@ def _split(where: str, line: str, separator: str) -> list[str]:
     try:
         return next(csv.reader([line], delimiter=separator, strict=True))
     except (csv.Error, StopIteration) as error:
-        kind = {",": "comma", ";": "semicolon", "\t": "tab"}[separator]
+        kind = {",": "comma", ";": "semicolon", "\t": "tab", " ": "blank"}[separator]
         raise BadInputError(f"{where}: is not {kind}-separated: {error}") from error
 
 
@@ -109,6 +109,8 @@ _BEGINS = (b"#", b"\n\n", b"\n\r", b"\n ", b"\n\t")
 
 def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[Block, int]:
     """Rows of whole lines, and the number of the next line."""
+    if text.separator == " ":
+        data = b"\n".join(b" ".join(line.split()) for line in data.split(b"\n"))
     count = data.count(b"\n")
     lines = np.arange(first_line, first_line + count, dtype=np.int64)
     suspect = data[:1].isspace() or any(one in data for one in _BEGINS)
@@ -116,16 +118,21 @@ def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[Block, int]:
         every = data.split(b"\n")[:-1]
         rows = [n for n, line in enumerate(every) if line.strip() and not line.lstrip().startswith(b"#")]
         data, lines = b"".join(every[n] + b"\n" for n in rows), lines[rows]
-    block = _by_pyarrow(text, data, lines) or _by_lines(text, data, lines)
-    return _timed(text.source, block), first_line + count
+    return _by_pyarrow(text, data, lines) or _by_lines(text, data, lines), first_line + count
 
 
-def _timed(source: str, block: Block) -> Block:
-    """The block. Raises `BadInputError` for a row without time."""
-    bad = np.nonzero(~np.isfinite(block.cells["t_s"]))[0]
-    if len(bad):
-        raise BadInputError(f"{source}, line {block.lines[bad[0]]}: has no time t_s, expected a number")
-    return block
+def _timed(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Block]:
+    """The blocks, with the times of rows that are numbered. Raises `BadInputError` for a row without time."""
+    row = 0
+    for block in blocks:
+        if columns.rate_hz:
+            times = np.arange(row, row + len(block.lines)) / columns.rate_hz
+            block, row = replace(block, cells={"t_s": times, **block.cells}), row + len(times)
+        bad = np.nonzero(~np.isfinite(block.cells["t_s"]))[0]
+        if len(bad):
+            where = f"{columns.source}, line {block.lines[bad[0]]}"
+            raise BadInputError(f"{where}: has no time t_s, expected a number")
+        yield block
 
 
 def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
@@ -210,6 +217,15 @@ def _separator(line: str) -> str:
     return ","
 
 
+def _mark(line: str) -> str:
+    """The mark between the cells of a log's first line, which may be blanks."""
+    mark, words = _separator(line), line.split()
+    if mark != "," or "," in line or len(words) < 3:
+        return mark
+    named = any((known_name(word) or ("",))[0] == "t_s" for word in words)
+    return " " if named or _numeric(words, " ") else ","
+
+
 def _numeric(cells: Sequence[str], separator: str) -> bool:
     """Whether cells are those of a row and not of a header."""
     words = [cell.strip() for cell in cells if cell.strip()]
@@ -225,13 +241,15 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
     """
     file = columns_file(path, options)
     line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
-    while raw.endswith(b"\n") and (not raw.strip() or raw.lstrip(b"\xef\xbb\xbf").startswith(b"#")):
-        comment = raw.decode("utf-8-sig", "replace").lstrip("#% ").rstrip("\r\n") or comment
+    while raw.endswith(b"\n") and (
+        not raw.strip() or raw.lstrip(b"\xef\xbb\xbf \t").startswith((b"#", b"//"))
+    ):
+        comment = raw.decode("utf-8-sig", "replace").lstrip("#%/ \t").rstrip("\r\n") or comment
         line, raw = line + 1, stream.readline(_LONGEST_LINE)
     ahead, above = b"", ""
-    if not _is_header(raw):
-        first, lines = raw, list(_lines_up_to_a_header(stream))
-        if lines and _is_header(lines[-1]):
+    if not _is_header(raw, file):
+        first, lines = raw, list(_lines_up_to_a_header(stream, file))
+        if lines and _is_header(lines[-1], file):
             # What a board or a terminal says before the table.
             line, raw = line + len(lines), lines[-1]
             said = one_line(first.decode("utf-8", "replace").strip())[:40]
@@ -249,21 +267,26 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
         raise BadInputError(f"{where}: is not UTF-8 text (byte {error.start}), expected a header") from error
     if "\0" in head:
         raise BadInputError(f"{where}: has a zero byte, expected a text file")
-    separator = (file and file.separator) or _separator(head)
-    names = _split(where, head.rstrip("\r\n"), separator)
-    if len(names) == 1 and any((known_name(word) or ("",))[0] == "t_s" for word in head.split()[:-1]):
-        raise BadInputError(f"{where}: has blanks between its columns, expected commas, semicolons or tabs")
+    separator = (file and file.separator) or _mark(head)
+    names = head.split() if separator == " " else _split(where, head.rstrip("\r\n"), separator)
     if len(names) > _MAX_COLUMNS:
         raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
     rows = b""
     if _numeric(names, separator):
         names, rows = _without_header(where, path, names, comment, separator, file), raw
-    columns = column_map(source, path, line, names, file, options)
     start = rows + ahead + stream.read(_BLOCK_BYTES)
     head = start[: 1 << 14].decode("utf-8", "replace")
+    # Boards that print a mark after each cell print one at the end of the row, and often none in the header.
+    cells = _first_row(head, separator)
+    if len(cells) == len(names) + 1 and not cells[-1].strip():
+        names = [*names, ""]
+    elif len(cells) == len(names) - 1 and not names[-1].strip():
+        names = names[:-1]
+    columns = column_map(source, path, line, names, file, options)
     comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
     decimal = (file and file.decimal) or ("," if comma else ".")
-    dates = _has_dates(head, columns.names.index(columns.sources["t_s"].column), separator)
+    time = columns.sources["t_s"].column
+    dates = bool(time) and _has_dates(cells, columns.names.index(time))
     if above:
         columns = replace(columns, above=above)
     text = _Text(source, _with_dates(columns) if dates else columns, separator, decimal, dates)
@@ -273,28 +296,34 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
 _MOST_ABOVE = 50
 
 
-def _lines_up_to_a_header(stream: BinaryIO) -> Iterator[bytes]:
+def _lines_up_to_a_header(stream: BinaryIO, file: ColumnsFile | None) -> Iterator[bytes]:
     """The next lines, at most so many, up to one that is a header."""
     for _ in range(_MOST_ABOVE):
         raw = stream.readline(_LONGEST_LINE)
         if raw:
             yield raw
-        if not raw.endswith(b"\n") or _is_header(raw):
+        if not raw.endswith(b"\n") or _is_header(raw, file):
             return
 
 
-def _is_header(raw: bytes) -> bool:
-    """Whether a line names the time and another column."""
+def _is_header(raw: bytes, file: ColumnsFile | None) -> bool:
+    """Whether a line names the time and another column, or three columns."""
     text = raw.decode("utf-8-sig", "replace").strip()
-    known = [known_name(name.strip().strip('"')) for name in text.split(_separator(text))]
+    names = [name.strip().strip('"') for name in text.split((file and file.separator) or _mark(text))]
+    stated = {one.column: column for column, one in file.sources.items()} if file else {}
+    known = [(stated[name],) if name in stated else known_name(name) for name in names]
     found = {one[0] for one in known if one is not None}
-    return "t_s" in found and len(found) > 1
+    return ("t_s" in found and len(found) > 1) or len(found) > 2
 
 
-def _has_dates(head: str, slot: int, separator: str) -> bool:
-    """Whether the times in the first row are dates."""
+def _first_row(head: str, separator: str) -> list[str]:
+    """Cells of the first row; none without one."""
     row = next((row for row in head.split("\n") if row.strip() and not row.lstrip().startswith("#")), "")
-    cells = row.split(separator)
+    return row.split() if separator == " " else row.rstrip("\r").split(separator)
+
+
+def _has_dates(cells: Sequence[str], slot: int) -> bool:
+    """Whether the times in a row are dates."""
     word = cells[slot].strip().strip('"') if slot < len(cells) else ""
     return plain_number(word) is None and _date_s(word) is not None
 
@@ -313,7 +342,7 @@ def _without_header(
         return list(file.names)
     if file is not None and any(one.column in numbers for one in file.sources.values()):
         return numbers
-    named = [name.strip() for name in comment.split(separator)]
+    named = comment.split() if separator == " " else [name.strip() for name in comment.split(separator)]
     if len(named) == len(cells) and any((known_name(name) or ("",))[0] == "t_s" for name in named):
         return named
     raise BadInputError(
@@ -327,7 +356,7 @@ def text_blocks(
 ) -> tuple[ColumnMap, Iterator[Block]]:
     """Columns of a text log that is open, and its rows; columns.yaml is looked for beside `path`."""
     text, data, line = _opened(stream, source, path, options)
-    return text.columns, _blocks(text, stream, data, line)
+    return text.columns, _timed(text.columns, _blocks(text, stream, data, line))
 
 
 def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[Block]:
@@ -347,7 +376,8 @@ def _blocks(text: _Text, stream: BinaryIO, data: bytes, line: int) -> Iterator[B
     if not rest.strip() or rest.lstrip().startswith(b"#"):
         return
     # The last line without its end: a row, or the beginning of one.
-    if rest.count(text.separator.encode()) < len(text.columns.names) - 1:
+    cells = rest.split() if text.separator == " " else rest.split(text.separator.encode())
+    if len(cells) < len(text.columns.names):
         nothing = {name: np.empty(0) for name in text.slots}
         yield Block(nothing, np.empty(0, dtype=np.int64), Passed(truncated=True))
     else:
@@ -395,16 +425,16 @@ def parquet_blocks(path: Path, options: LogOptions) -> tuple[ColumnMap, Iterator
     with _parquet_errors(shown(path)):
         file = parquet.ParquetFile(path, pre_buffer=False)
         columns = column_map(shown(path), path, 1, file.schema_arrow.names, named, options)
-        time = file.schema_arrow.field(columns.sources["t_s"].column).type
-        columns = _with_dates(columns) if pyarrow.types.is_timestamp(time) else columns
-        read = [one.column for one in columns.sources.values()]
-        for name in read:
+        read = columns.read
+        if "t_s" in read and pyarrow.types.is_timestamp(file.schema_arrow.field(read["t_s"]).type):
+            columns = _with_dates(columns)
+        for name in read.values():
             # A text that comes often stands in the file once.
             kind = file.schema_arrow.field(name).type
             if not (pyarrow.types.is_primitive(kind) or pyarrow.types.is_null(kind)):
                 raise BadInputError(f"{columns.source}: {name} holds {kind}, expected numbers")
-        _check_growth(path, file.metadata, read)
-    return columns, _parquet_blocks(file, columns)
+        _check_growth(path, file.metadata, read.values())
+    return columns, _timed(columns, _parquet_blocks(file, columns))
 
 
 @contextmanager
@@ -417,7 +447,7 @@ def _parquet_errors(source: str) -> Iterator[None]:
         raise BadInputError(f"{source}: is not a Parquet file that can be read: {error}") from error
 
 
-def _check_growth(path: Path, metadata: Any, read: Sequence[str]) -> None:
+def _check_growth(path: Path, metadata: Any, read: Collection[str]) -> None:
     """Raise `BadInputError` where the columns that are read unpack to more than their budget.
 
     A column of equal numbers takes a few bytes however long it is, so rows count as well as what pages
@@ -437,18 +467,18 @@ def _check_growth(path: Path, metadata: Any, read: Sequence[str]) -> None:
 
 
 def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[Block]:
-    first, read = 1, [one.column for one in columns.sources.values()]
+    first, read = 1, columns.read
     with _parquet_errors(columns.source):
-        for batch in file.iter_batches(batch_size=65536, columns=read):
+        for batch in file.iter_batches(batch_size=65536, columns=list(read.values())):
             cells, odd = {}, 0
-            for name, one in columns.sources.items():
-                values = _parquet_column(columns.source, batch.column(one.column), one.column).copy()
+            for name, column in read.items():
+                values = _parquet_column(columns.source, batch.column(column), column).copy()
                 infinite = np.isinf(values)
                 values[infinite] = np.nan
                 cells[name], odd = values, odd + int(infinite.sum())
             block = Block(cells, np.arange(first, first + len(batch), dtype=np.int64), Passed(odd))
             first += len(batch)
-            yield _timed(columns.source, block)
+            yield block
 
 
 def _parquet_column(source: str, column: Any, name: str) -> FloatArray:

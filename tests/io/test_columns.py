@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 
 from calib.core.arrays import FloatArray
@@ -62,6 +64,12 @@ def _written(
         ("pixy_y", ("v_px", "px")),
         ("duty1", ("pwm1", "pwm")),
         ("onchip_phi_deg", ("onchip_phi_rad", "deg")),
+        ("AcX", ("ax_mps2", "")),
+        ("GyZ", ("gz_radps", "")),
+        ("zAccl", ("az_mps2", "")),
+        ("xGyro", ("gx_radps", "")),
+        ("seconds_elapsed", ("t_s", "s")),
+        ("time_boot_ms", ("t_s", "ms")),
         ("Magnetometer X (uT)", None),
         ("temperature", None),
         ("gear", None),
@@ -112,6 +120,49 @@ def test_marks_of_other_countries(tmp_path: Path, mark: str, comma: str) -> None
     log = read_log(_written(tmp_path / "log.csv", names, [t, *values.T], mark, comma))
     plain = read_log(_written(tmp_path / "plain.csv", names, [t, *values.T]))
     assert all(np.array_equal(log.columns[name], plain.columns[name]) for name in AXES)
+
+
+@pytest.mark.parametrize("header", ["t_s " + " ".join(AXES), "# t_s " + " ".join(AXES)])
+def test_blanks_between_cells_as_savetxt_writes_them(tmp_path: Path, header: str) -> None:
+    t, values = _imu()
+    path, plain = tmp_path / "log.txt", _written(tmp_path / "plain.csv", ["t_s", *AXES], [t, *values.T])
+    np.savetxt(path, np.column_stack([t, values]), "%14.9g", header=header, comments="")
+    # A last line that is still being written is no row.
+    path.write_text(path.read_text() + "  30.0 0.1")
+    log, expected = read_log(path), read_log(plain)
+    assert np.array_equal(log.t_s, expected.t_s) and log.passed.truncated
+    assert all(np.allclose(log.columns[name], expected.columns[name], rtol=1e-8) for name in AXES)
+
+
+def test_rows_without_a_time_are_counted_at_the_rate_that_is_stated(tmp_path: Path) -> None:
+    t, values = _imu()
+    names = ["Counter", "Acc_X", "Acc_Y", "Acc_Z", "Gyr_X", "Gyr_Y", "Gyr_Z"]
+    count = np.arange(len(t), dtype=np.float64)
+    head = "// a device\n// Rate: 100 Hz\n" + ",".join(names)
+    path = _written(tmp_path / "log.csv", names, [count, *values.T], head=head)
+    # A mark after the last cell, which the header has not.
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    path.write_text("\n".join([*lines[:3], *(line + "," for line in lines[3:])]) + "\n")
+    words = r"line 3: has no column t_s, .*if Counter counts samples, t_s: \{column: Counter, .*rate_hz: RATE"
+    with pytest.raises(BadInputError, match=words):
+        read_log(path)
+    (tmp_path / "columns.yaml").write_text("t_s: {column: Counter, factor: 0.01}\n")
+    by_counter = read_log(path)
+    (tmp_path / "columns.yaml").write_text("rate_hz: 100\n")
+    counted = read_log(path)
+    assert counted.map is not None and "times counted in rows at 100 Hz" in counted.map.narration
+    (tmp_path / "columns.yaml").write_text(counted.map.text())
+    again = read_log(path)
+    for log in (by_counter, counted, again):
+        assert np.allclose(log.t_s, count / 100.0, rtol=0.0, atol=1e-9)
+        assert np.allclose(log.columns["gz_radps"], values[:, 5])
+    parquet = tmp_path / "log.parquet"
+    table = pyarrow.table({name: values[:, k] for k, name in enumerate(AXES)})
+    pyarrow.parquet.write_table(table, parquet)
+    assert np.array_equal(read_log(parquet).t_s, counted.t_s)
+    timed = _written(tmp_path / "timed.csv", ["t_s", *AXES], [t, *values.T])
+    with pytest.raises(BadInputError, match=r"has the time `t_s`, and .* says rate_hz"):
+        read_log(timed)
 
 
 @pytest.mark.parametrize(
@@ -297,6 +348,7 @@ def test_a_gyroscope_at_rest_that_may_be_either_is_not_guessed(tmp_path: Path) -
         ("gz_radps: {column: gz, factor: much}\n", "gz_radps.factor is 'much', expected a number"),
         ("units: {accel: lb}\n", "units.accel is 'lb', expected one of m/s2, g"),
         ("names: 3\n", "names is 3, expected a list"),
+        ("rate_hz: 0\n", "rate_hz is 0, expected rows a second"),
         ("separator: '|'\n", "separator is '|', expected one of"),
     ],
 )
