@@ -33,6 +33,7 @@ from calib.stages.actuator.identify import (
     jacobian,
     judge,
     made,
+    moved_camera,
     own_delays,
     prospects,
     pump_delay,
@@ -424,6 +425,30 @@ def test_pictures_late_in_one_log_alone_are_named(late_s: float) -> None:
     else:
         assert max(map(abs, apart.values())) < 4.0
         assert verdict.word == "ok"
+
+
+@pytest.mark.parametrize(("which", "from_s"), [(0, 2.0), (1, 1.5), (1, 0.0), (None, 0.0)])
+def test_a_camera_that_moves_in_a_log_or_between_logs_is_named(which: int | None, from_s: float) -> None:
+    tracks = [track("prbs"), replace(track("prbs", seed=1), name="other")]
+    if which is not None:
+        one = tracks[which]
+        shift = np.array([0.01, -0.001]) * (one.t_s >= from_s)[:, None]
+        tracks[which] = replace(one, head=one.head + shift)
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "bending_N_per_rad2")
+    problem = Problem(Machine(), tracks, names, {})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    verdict = judge(found, uncertainty(found), colour_of(found), [], [])
+    said = [one.text for one in verdict.findings if "its pictures are shifted" in one.text]
+    assert verdict.word == ("ok" if which is None else "inconsistent")
+    assert len(said) == (which is not None)
+    if which is not None:
+        moved = moved_camera(found)
+        assert moved is not None
+        # Which of two logs stands apart as a whole nothing tells.
+        assert not from_s or moved.name == tracks[which].name
+        assert moved.from_s == pytest.approx(from_s, abs=0.2)
+        assert abs(moved.length_m) == pytest.approx(1e-3, rel=0.2)
 
 
 @pytest.mark.slow

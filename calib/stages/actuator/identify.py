@@ -1816,12 +1816,7 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
             f"the residuals are so coloured that the deviation of {label_of(worst)} had to be raised "
             f"{known.inflation[worst]:.1f} times"
         )
-    loop_s = solution.problem.nominal.pump.tick_s
-    slow = {
-        track.name: track.tick_s
-        for track in solution.problem.tracks
-        if track.hoses and track.tick_s > _SLOW * loop_s
-    }
+    slow = _slowly_commanded(solution.problem)
     for colour in colours:
         if not colour.white:
             remark(
@@ -1843,6 +1838,13 @@ def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -
     if solution.starts > 1 and solution.agreeing == 1:
         remark(f"one of {solution.starts} starts alone came to this minimum; there may be others")
     return out
+
+
+def _slowly_commanded(problem: Problem) -> dict[str, float]:
+    """Periods [s] of the commands of logs that hold fewer of them than the pumps are known to get."""
+    loop_s = problem.nominal.pump.tick_s
+    pumped = [track for track in problem.tracks if track.hoses]
+    return {track.name: track.tick_s for track in pumped if track.tick_s > _SLOW * loop_s}
 
 
 def _one_more(solution: Solution, columns: Iterable[FloatArray]) -> Iterator[tuple[float, float] | None]:
@@ -1898,6 +1900,50 @@ def pump_delay(solution: Solution) -> tuple[float, float] | None:
     return next(iter(_one_more(solution, [column]))) if np.isfinite(column).all() and column.any() else None
 
 
+@dataclass(frozen=True)
+class Moved:
+    """A shift of all poses of a log from a time on: by angle [rad] and length [m], in deviations.
+
+    Attributes
+    ----------
+    from_s : time in the log; zero for all of it. readings : the shift over the noise of one reading.
+    """
+
+    name: str
+    from_s: float
+    phi_rad: float
+    length_m: float
+    readings: float
+    deviations: float
+
+
+def moved_camera(solution: Solution) -> Moved | None:
+    """The clearest shift of a log's pictures from some time on, alike in pixels: of a camera that moved."""
+    problem, r, J = solution.problem, solution.residual, solution.J
+    w = weights(problem, r)
+    WJ = J * w[:, None]
+    inverse, found = scaled_inverse(WJ.T @ J), list[Moved]()
+    pull = inverse @ (WJ.T @ r)
+    for track, span in zip(problem.tracks, problem.spans, strict=True):
+        # Sums from each row on, over both whitened readings: of pictures they are u and v.
+        by, slope, power = (
+            np.cumsum(rows[span].reshape(len(track.t_s), 2, -1)[::-1], axis=0)[::-1]
+            for rows in (WJ, w * r, w)
+        )
+        ends = np.linspace(0.0, len(track.t_s), _MOMENTS + 1)[:-1].astype(int)
+        for k in ends if len(problem.tracks) > 1 else ends[1:]:
+            own = np.diag(power[k, :, 0]) - by[k] @ inverse @ by[k].T
+            size, axes = np.linalg.eigh(own)
+            if size[0] > 1e-6 * power[k].max():
+                g = slope[k, :, 0] - by[k] @ pull
+                shift = -axes @ ((axes.T @ g) / size)
+                phi, length = np.linalg.solve(track.whitening[k], shift).tolist()
+                at = float(track.t_s[k]) if k else 0.0
+                far = math.sqrt(max(float(-shift @ g), 0.0))
+                found.append(Moved(track.name, at, phi, length, float(np.linalg.norm(shift)), far))
+    return max(found, key=lambda one: one.deviations, default=None)
+
+
 def by_logs(solution: Solution) -> dict[str, tuple[float, float]]:
     """What logs make of each value that is stated without a deviation, to first order, and the deviation."""
     problem, values = solution.problem, values_of(solution.problem.nominal)
@@ -1915,6 +1961,9 @@ def by_logs(solution: Solution) -> dict[str, tuple[float, float]]:
     return {name: (values[name] + one[0], one[1]) for name, one in found if one is not None}
 
 
+_MOMENTS = 20
+_LEAST_READINGS = 0.5
+"""Moments of a log at which a camera may have moved; noises of a reading, .2 px, below which it has not."""
 _STATED_OFF = 0.02
 _CROSSED, _BENDS_RAD = -0.5, 0.05
 
@@ -1958,6 +2007,23 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
             )
             advice = "measure it and the mass again, or state its standard deviation under known"
             out.append(Finding("inconsistent", text, advice))
+    moved, slow = moved_camera(solution), _slowly_commanded(solution.problem)
+    if (
+        moved is not None
+        and moved.name not in slow
+        and moved.readings > _LEAST_READINGS
+        and moved.deviations > _APART_SIGMA * raised
+    ):
+        when, then = f"from about {moved.from_s:.1f} s on", "cut the log there, and"
+        if not moved.from_s:
+            when, then = "against those of the other logs", "keep it apart, and"
+        text = (
+            f"{moved.name}: its pictures are shifted {when}, as if the head had turned by "
+            f"{math.degrees(moved.phi_rad):+.1f} degrees and grown by {1e3 * moved.length_m:+.1f} mm; the "
+            "camera, or the marker on the head, has moved"
+        )
+        advice = f"{then} calibrate the plane anew (calib extrinsics) for the pictures after that"
+        out.append(Finding("inconsistent", text, advice))
     for name, alike in crossed(solution).items():
         if alike < _CROSSED:
             text = f"{name}: the head bends away from the pump that pushes, correlation {alike:.2f}"
