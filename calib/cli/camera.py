@@ -190,7 +190,9 @@ def _imported(from_: str, source: Path, data: bytes) -> tuple[str, Any, tuple[st
     text = as_text(source, data)
     camera = {"ros": from_ros, "opencv": from_opencv, "kalibr": from_kalibr}[from_](text)
     others = re.findall(r"^cam[1-9]\d*(?=:)", text, re.MULTILINE) if from_ == "kalibr" else []
-    left = (f"cam0 is taken, {' and '.join(others)} left out",) if others else ()
+    left = [f"cam0 is taken, {' and '.join(others)} left out"] if others else []
+    if from_ == "kalibr" and re.search(r"^\s+(T_cam_imu|timeshift_cam_imu):", text, re.MULTILINE):
+        left.append("T_cam_imu and timeshift_cam_imu are not read: calib align finds time offset and angle")
     width, height = camera.image_size_px
     lacks = "it comes without error bars, so its verdict is poor until calib intrinsics has seen pictures"
     words = (f"camera {camera.model}, {width}x{height} px", *left, lacks)

@@ -148,6 +148,46 @@ def test_a_file_as_ros_writes_it() -> None:
         assert camera.distortion.tolist() == [0.0186, -0.0808, 6.7e-4, 1e-5, 0, 0, 0, 0]
 
 
+MESSAGE = """
+header:
+  stamp: {secs: 0, nsecs: 0}
+height: 480
+width: 640
+distortion_model: "rational_polynomial"
+D: [1.1, 0.2, 0.001, 0.002, 0.03, 1.3, 0.4, 0.05, 0, 0, 0, 0, 0, 0]
+K: [533.6, 0.0, 342.4, 0.0, 533.7, 234.2, 0.0, 0.0, 1.0]
+R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+binning_x: 0
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: False}
+---
+"""
+
+
+@pytest.mark.parametrize("lower", [False, True])
+def test_a_message_as_ros_prints_it(lower: bool) -> None:
+    text = MESSAGE
+    for upper in "DKR":
+        text = text.replace(f"\n{upper}:", f"\n{upper.lower()}:") if lower else text
+    camera = from_ros(text + text.replace("640", "320"))
+    assert camera.image_size_px == (640, 480)
+    assert (camera.model, camera.fx_px, camera.cy_px) == ("rational8", 533.6, 234.2)
+    assert camera.distortion.tolist() == [1.1, 0.2, 0.001, 0.002, 0.03, 1.3, 0.4, 0.05]
+    with pytest.raises(BadInputError, match=r"holds s1 = 0\.1, which cannot be expressed"):
+        from_ros(text.replace("0.05, 0,", "0.05, 0.1,"))
+
+
+def test_names_of_the_sample_of_opencv_2() -> None:
+    camera, text = camera_of("brown5"), to_opencv(camera_of("brown5"))
+    for new, old in (
+        ("image_width", "image_Width"),
+        ("image_height", "image_Height"),
+        ("camera_matrix", "Camera_Matrix"),
+        ("distortion_coefficients", "Distortion_Coefficients"),
+    ):
+        text = text.replace(f"{new}:", f"{old}:")
+    assert same(from_opencv(text), camera)
+
+
 def test_files_of_opencv_with_more_coefficients() -> None:
     text = to_opencv(camera_of("rational8"))
     storage = cv2.FileStorage("a.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -188,7 +228,8 @@ def test_wrong_ros_files_are_refused_by_key(old: str, new: str, words: str) -> N
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("image_width: 316\n", "", "image_width is missing"),
+        ("image_width: 316\n", "", "image_width is missing; the file has image_height, camera_matrix"),
+        (" !!opencv-matrix", "", "camera_matrix is no !!opencv-matrix; .* with calib import ros"),
         ("camera_matrix:", "matrix:", "camera_matrix is missing"),
         ("image_width: 316", "fisheye_model: 1\nimage_width: 316", "fisheye"),
         ("rows: 5\n   cols: 1", "rows: 6\n   cols: 1", "not a matrix|has 6 numbers"),

@@ -372,8 +372,10 @@ def test_one_camera_of_a_chain_is_taken_and_the_others_are_named(calib, rig, tmp
     file = tmp_path / "camchain.yaml"
     assert calib("export", "kalibr", "--rig", rig, "-o", file).code == 0
     one = file.read_text()
-    file.write_text(one + one.replace("cam0", "cam1"))
-    assert "cam0 is taken, cam1 left out" in calib("import", "kalibr", file, "--rig", tmp_path / "a.yaml").out
+    file.write_text(one + "  timeshift_cam_imu: 0.005\n" + one.replace("cam0", "cam1"))
+    out = calib("import", "kalibr", file, "--rig", tmp_path / "a.yaml").out
+    assert "cam0 is taken, cam1 left out" in out
+    assert "timeshift_cam_imu are not read" in out
 
 
 BAD = {

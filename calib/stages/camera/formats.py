@@ -19,7 +19,7 @@ import yaml
 from calib.core.arrays import FloatArray
 from calib.core.bounded_yaml import YamlProblem, load
 from calib.core.errors import BadInputError
-from calib.core.files import quoted
+from calib.core.files import one_line, quoted
 from calib.core.writing import Kind, holds
 from calib.stages.camera.model import COEFFICIENTS, FISHEYE, MODELS, Camera
 
@@ -202,6 +202,13 @@ def _xml(text: str) -> object:
 _BROWN = len(MODELS["brown5"])
 _BEYOND_RATIONAL = ("s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """OpenCV's thin prism and tilted sensor, which no model here has."""
+_OLD_NAMES = {
+    "image_Width": "image_width",
+    "image_Height": "image_height",
+    "Camera_Matrix": "camera_matrix",
+    "Distortion_Coefficients": "distortion_coefficients",
+}
+"""Names that the calibration sample of OpenCV 2 writes, and those that later samples do."""
 _SKEW_LIMIT = 1e-12
 _FISHEYE = [COEFFICIENTS.index(name) for name in MODELS[FISHEYE]]
 """Places of the fisheye model's coefficients among `COEFFICIENTS`."""
@@ -247,20 +254,21 @@ def to_ros(camera: Camera, name: str = "camera") -> str:
 
 
 def from_ros(text: str) -> Camera:
-    """Camera from a ROS camera_info YAML.
+    """Camera from a ROS camera_info YAML, or from the message as `ros2 topic echo` prints it.
 
-    The rectification and projection matrices say how pictures are to be rectified, not what the camera
-    is, and are not read.
+    Of several messages the first is read. The rectification and projection matrices say how pictures are
+    to be rectified, not what the camera is, and are not read; neither are binning and region of interest:
+    a message's numbers are those of the full picture.
 
     Raises
     ------
     BadInputError
         Naming the key that is missing or wrong, or the distortion model that cannot be expressed.
     """
-    document = _mapping(text)
+    document = _of_message(_mapping(_first_document(text)))
     size = (_whole(document, "image_width"), _whole(document, "image_height"))
     model = document.get("distortion_model")
-    lengths = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+    lengths = {"plumb_bob": (0, 4, 5), "rational_polynomial": (12, 14, 8), "equidistant": (4,)}
     if not isinstance(model, str) or model not in lengths:
         raise BadInputError(
             f"distortion_model is {quoted(model)}, expected plumb_bob, rational_polynomial or equidistant; "
@@ -273,7 +281,38 @@ def from_ros(text: str) -> Camera:
             f"for {model}"
         )
     K = _ros_matrix(document, "camera_matrix")
-    return _camera(size, K, coefficients.ravel(), "camera_matrix", fisheye=model == "equidistant")
+    used = _rational(coefficients.ravel())
+    return _camera(size, K, used, "camera_matrix", fisheye=model == "equidistant")
+
+
+def _first_document(text: str) -> str:
+    """Text up to the line `---`, which `rostopic echo` prints after each message."""
+    begun = re.sub(r"\A---[ \t]*\n", "", _without_directive(text).lstrip())
+    return re.split(r"(?m)^---[ \t]*$", begun, maxsplit=1)[0]
+
+
+def _of_message(document: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The keys of a camera_info file for those of a sensor_msgs/CameraInfo, which ROS 1 calls K and D."""
+    K, D = (document.get(upper, document.get(upper.lower())) for upper in "KD")
+    if not isinstance(K, list) or not isinstance(D, list):
+        return document
+    return {
+        "image_width": document.get("width"),
+        "image_height": document.get("height"),
+        "distortion_model": document.get("distortion_model"),
+        "camera_matrix": {"rows": 3, "cols": 3, "data": K},
+        "distortion_coefficients": {"rows": 1, "cols": len(D), "data": D},
+    }
+
+
+def _rational(coefficients: FloatArray) -> FloatArray:
+    """The first eight coefficients, if OpenCV's others are zero."""
+    for name, value in zip(_BEYOND_RATIONAL, coefficients[len(COEFFICIENTS) :], strict=False):
+        if value != 0.0:
+            raise BadInputError(
+                f"distortion_coefficients holds {name} = {value:g}, which cannot be expressed"
+            )
+    return coefficients[: len(COEFFICIENTS)]
 
 
 def to_opencv(camera: Camera) -> str:
@@ -299,7 +338,7 @@ def from_opencv(text: str) -> Camera:
         For text that is no FileStorage, a missing or wrong key, or coefficients of OpenCV's thin-prism
         and tilted models that are not zero.
     """
-    root = read_storage(text)
+    root = {_OLD_NAMES.get(name, name): value for name, value in read_storage(text).items()}
     fisheye = root.get("fisheye_model", 0)
     if fisheye not in (0, 1):
         raise BadInputError(f"fisheye_model is {quoted(fisheye)}, expected 0 or 1")
@@ -311,12 +350,7 @@ def from_opencv(text: str) -> Camera:
             f"distortion_coefficients has {coefficients.size} numbers, expected "
             + ("4 of a fisheye lens" if fisheye else "4, 5, 8, 12 or 14")
         )
-    for name, value in zip(_BEYOND_RATIONAL, coefficients[len(COEFFICIENTS) :], strict=False):
-        if value != 0.0:
-            raise BadInputError(
-                f"distortion_coefficients holds {name} = {value:g}, which cannot be expressed"
-            )
-    used = coefficients[: len(COEFFICIENTS)]
+    used = _rational(coefficients)
     return _camera((width, height), K, used, "camera_matrix", fisheye=bool(fisheye))
 
 
@@ -444,9 +478,15 @@ def _whole(document: Mapping[str, Any], key: str) -> int:
     value = document.get(key)
     if not isinstance(value, int) or isinstance(value, bool):
         raise BadInputError(
-            f"{key} is missing" if value is None else f"{key} is {quoted(value)}, expected a whole number"
+            _missing(key, document) if value is None else f"{key} is {quoted(value)}, expected a whole number"
         )
     return value
+
+
+def _missing(key: str, document: Mapping[str, Any]) -> str:
+    """That a key is missing, and the first of those that are there."""
+    there = ", ".join(one_line(str(name))[:40] for name in list(document)[:5]) or "nothing"
+    return f"{key} is missing; the file has {there}"
 
 
 def _numbers(values: object, key: str, count: int) -> list[float]:
@@ -467,16 +507,19 @@ def _numbers(values: object, key: str, count: int) -> list[float]:
 def _ros_matrix(document: Mapping[str, Any], key: str) -> FloatArray:
     node = document.get(key)
     if not isinstance(node, dict):
-        raise BadInputError(f"{key} is missing" if node is None else f"{key} has no rows, cols and data")
+        raise BadInputError(_missing(key, document) if node is None else f"{key} has no rows, cols and data")
     rows, cols = _whole(node, "rows"), _whole(node, "cols")
     data = _numbers(node.get("data"), f"{key}.data", rows * cols)
     return np.array(data, dtype=np.float64).reshape(rows, cols)
 
 
 def _storage_matrix(root: Mapping[str, Any], key: str) -> FloatArray:
-    if root.get(key) is None:
-        raise BadInputError(f"{key} is missing")
-    values = matrix(root[key])
+    node = root.get(key)
+    if node is None:
+        raise BadInputError(_missing(key, root))
+    values = matrix(node)
+    if values is None and isinstance(node, dict) and _TYPE not in node:
+        raise BadInputError(f"{key} is no !!opencv-matrix; import a camera_info of ROS with calib import ros")
     if values is None:
         raise BadInputError(f"{key} is not a matrix of finite numbers")
     return values
