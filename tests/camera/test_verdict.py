@@ -105,6 +105,18 @@ def test_two_cameras_are_told_apart_view_by_view() -> None:
     assert len(group) == 13
 
 
+def test_two_cameras_are_told_once_where_some_of_the_views_leave() -> None:
+    """Of all views it was told, and of those that agree once more."""
+    one = camera_of()
+    other = replace(one, cx_px=one.cx_px - 18.0, cy_px=one.cy_px + 18.0)
+    views = [*take(np.random.default_rng(3), one, 13), *take(np.random.default_rng(53), other, 13)]
+    for i, view in enumerate(views):
+        blurred = np.random.default_rng([3, i]).normal(0.0, 0.15, view.pixels.shape)
+        views[i] = replace(view, name=f"{'ab'[i // 13]}{i}", pixels=view.pixels + blurred)
+    found = calibrate_camera(views, one.image_size_px, Choices("radial2")).verdict
+    assert sum("From b13 on the camera differs" in sentence for sentence in found.reasons) == 1
+
+
 def test_a_lens_model_that_is_too_poor_is_said_and_not_taken_for_a_bent_board() -> None:
     views = take(np.random.default_rng(2), camera_of(lens=(-0.25, 0.08)), 17)
     _, found = _judged(views, (640, 480), "pinhole")

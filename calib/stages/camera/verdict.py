@@ -587,6 +587,9 @@ def _repeated(calibration: Calibration) -> float:
     return float(np.sqrt((mean**2 * count[:, None]).mean() / spread)) if spread > 0.0 else 1.0
 
 
+_SEPARATELY = "Calibrate the two groups separately, with focus and zoom locked."
+
+
 def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding]:
     """One camera, or two."""
     if found is None or found.ratio < (Limits.change_ratio if found.in_order else Limits.split_ratio):
@@ -639,7 +642,7 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
         )
     else:
         text = f"The views come from two cameras: {second} from one, the other views from another {sure}."
-    yield Finding("inconsistent", text, "Calibrate the two groups separately, with focus and zoom locked.")
+    yield Finding("inconsistent", text, _SEPARATELY)
 
 
 def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[Finding]:
@@ -708,7 +711,9 @@ def judge(calibration: Calibration, findings: Sequence[Finding] = ()) -> Verdict
     if all(one.severity != "inconsistent" for one in faulty):
         # Else what is wrong follows from the views that are none.
         more, sturdy = _by_the_rules(calibration)
-        every += more
+        # Two cameras that all views tell need not be told of those that agree as well.
+        told = any(one.advice == _SEPARATELY for one in every)
+        every += [one for one in more if not (told and one.advice == _SEPARATELY)]
     if any(one.advice == _IN_CORNERS for one in every):
         # Which says the same and more.
         every = [replace(one, advice=_IN_CORNERS) if one.advice == _CORNERS else one for one in every]
