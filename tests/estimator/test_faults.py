@@ -17,7 +17,7 @@ from calib.stages.estimator.consistency import SENSORS, Tally
 from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import FLAGS, OUT
 from calib.stages.estimator.read import READINGS
-from calib.stages.estimator.replay import Estimate, consistent, contradicting, sampled, untimely
+from calib.stages.estimator.replay import Estimate, consistent, contradicting, jumped, sampled, untimely
 
 _LAST_PIXEL = {"u_px": 315.0, "v_px": 207.0}
 _UNIT = {"u_px": 0.5, "v_px": 0.5, "ax_mps2": 1 / 9.81, "ay_mps2": 1 / 9.81, "gz_radps": 57.3}
@@ -158,3 +158,20 @@ def test_delays_are_not_looked_for_in_a_log_at_rest() -> None:
     _, log = driven_log("static")
     late = _delayed(log, ("gz_radps",), 5)
     assert not list(untimely(setup_for(varied_drive(0)), rows_from(late)))
+
+
+@pytest.mark.parametrize("scenario", ["static", "ellipse"])
+@pytest.mark.parametrize(("name", "px"), [("v_px", 0.0), ("v_px", 3.0), ("u_px", -8.0)])
+def test_a_camera_that_moves_is_named_with_the_time(scenario: str, name: str, px: float) -> None:
+    """By 2 px along the actuator lengths are off by 1.6 mm, 7 of their deviations, and it was ok."""
+    _, log = driven_log(scenario)
+    t_s = 6.0
+    shifted = log.columns[name] + px * (log.t_s >= t_s)
+    moved = replace(log, columns={**log.columns, name: shifted})
+    tally = Tally(0.0126)
+    tally.add(Estimate(setup_for(varied_drive(0)), Drive(), "auto")(rows_from(moved), moved))
+    said = [finding.text for finding in jumped(tally)]
+    if px:
+        assert [text.startswith(f"at {t_s:.1f} s the marker jumps") for text in said] == [True]
+    else:
+        assert not said

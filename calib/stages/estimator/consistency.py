@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, robust_sigma
 from calib.core.result import finite_or_none
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.section import SensorCheck
@@ -26,6 +26,8 @@ SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
 _INNOVATIONS = {"camera": ("e_u", "e_v"), "accel": ("e_ax", "e_ay"), "gyro": ("e_gz",)}
 SETTLED_S = 2.0
 _LEVEL = 0.95
+_TOGETHER, _CLIPPED = 6, 6.0
+"""Pictures whose innovations are summed up to find a jump, and where each of them is cut."""
 
 
 def chi_square_band(degrees: int, draws: int) -> tuple[float, float]:
@@ -67,6 +69,8 @@ class Tally:
     )
     flags: dict[int, int] = field(default_factory=dict)
     squares: FloatArray = field(default_factory=lambda: np.zeros(8))
+    jump: tuple[float, float] = (0.0, math.nan)
+    """Where the pictures jump most, in deviations of what innovations sum up to, and when [s]."""
 
     def add(self, out: FloatArray, truth: FloatArray | None = None) -> None:
         """Rows of `kinematic.OUT`, and (n, 3) true q1, q2, phi, NaN where not known."""
@@ -82,6 +86,7 @@ class Tally:
         late = out[:, 0] >= self.start_s + SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])
+        self._add_jump(out[late])
         if truth is not None:
             self._add_truth(out[late], truth[late])
 
@@ -103,6 +108,21 @@ class Tally:
             sums[4 + 2 * k] += float((e[1:] * e[:-1]).sum())
             sums[5 + 2 * k] += float((e[1:] ** 2).sum())
             last[place] = e[-1]
+
+    def _add_jump(self, out: FloatArray) -> None:
+        """Innovations of a camera that was moved are alike until the filter has followed it.
+
+        With those that were gated out, and over what such sums are in this log, which wrong constants raise.
+        """
+        seen = out[np.isfinite(out[:, OUT.index("gated_camera")])]
+        e = seen[:, [OUT.index(column) for column in _INNOVATIONS["camera"]]]
+        if len(e) < 10 * _TOGETHER:
+            return
+        e = np.clip(np.nan_to_num(e), -_CLIPPED, _CLIPPED)
+        for sums in np.lib.stride_tricks.sliding_window_view(e, _TOGETHER, axis=0).sum(axis=2).T:
+            size = np.abs(sums) / max(robust_sigma(sums), math.sqrt(_TOGETHER))
+            k = int(np.argmax(size))
+            self.jump = max(self.jump, (float(size[k]), float(seen[k, 0])))
 
     def _add_truth(self, out: FloatArray, truth: FloatArray) -> None:
         known = np.isfinite(truth).all(axis=1)
