@@ -15,7 +15,7 @@ import numpy as np
 from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import check_readable, hash_of, is_bag, one_line, shown
-from calib.io.pictures import Picture, decoded_picture, eight_bits
+from calib.io.pictures import Picture, decoded_picture, eight_bits, of_one_field
 
 # ----------------------------------------------------------------------
 # One pass over the frames. A stretch is a run of frames, of which the sharpest is kept; when there are too
@@ -122,7 +122,7 @@ def _sharpness(gray: GrayImage) -> float:
 def _of_video(path: Path) -> Iterator[GrayImage]:
     for frame in timed_frames(path)[1]:
         gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        yield np.asarray(gray, dtype=np.uint8)
+        yield of_one_field(np.asarray(gray, dtype=np.uint8))
 
 
 # ----------------------------------------------------------------------
@@ -319,4 +319,4 @@ def _of_message(message: Any, where: str) -> GrayImage:
     if code is None:
         return eight_bits(rows.view(kind).reshape(height, width))
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows.reshape(height, width)
-    return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)
+    return of_one_field(np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8))

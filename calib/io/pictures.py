@@ -290,9 +290,12 @@ def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
 
 
 def eight_bits(decoded: AnyArray) -> GrayImage:
-    """Grey values of any depth as 8 bits, the brightest 0.1 % white; of a raw picture without its mosaic."""
+    """Grey values of any depth as 8 bits, the brightest 0.1 % white.
+
+    Of a raw picture without its mosaic, of an interlaced one of its first field.
+    """
     if decoded.dtype == np.uint8:
-        return _without_mosaic(np.ascontiguousarray(decoded, dtype=np.uint8))
+        return of_one_field(_without_mosaic(np.ascontiguousarray(decoded, dtype=np.uint8)))
     values = decoded.astype(np.float32)
     finite = np.isfinite(values)
     if not finite.all():
@@ -303,7 +306,8 @@ def eight_bits(decoded: AnyArray) -> GrayImage:
         return np.zeros(values.shape, dtype=np.uint8)
     values -= np.float32(low)
     values *= np.float32(255.0 / (white - low))
-    return _without_mosaic(np.clip(np.rint(values, out=values), 0, 255, out=values).astype(np.uint8))
+    gray = np.clip(np.rint(values, out=values), 0, 255, out=values).astype(np.uint8)
+    return of_one_field(_without_mosaic(gray))
 
 
 _MOSAIC = 0.08
@@ -336,6 +340,49 @@ def _without_mosaic(gray: GrayImage) -> GrayImage:
         return gray
     code = cv2.COLOR_BayerGR2GRAY if f * g < 0.0 else cv2.COLOR_BayerBG2GRAY
     return np.asarray(cv2.cvtColor(gray, code), dtype=np.uint8)
+
+
+_GRID = (12, 16)
+_FIELD_PIXELS = 300_000
+_MOVED_PX, _SHARE, _FEWEST = 0.5, 0.2, 12
+"""By how much edges must stand apart in odd rows, what share of the rows' differences that must explain, and
+in how many cells of the grid. Of 167 photographs none has more than 4 such cells, of sharpened ones 7; woven
+ones of boards that move by 0.5 to 10 pixels of a blurred edge have 40 and more."""
+_LEAST_SLOPE = 2.0
+"""Grey values per pixel, RMS over a cell of the grid."""
+
+
+def of_one_field(gray: GrayImage) -> GrayImage:
+    """An interlaced picture with its odd rows interpolated between the even ones; any other as it is.
+
+    Odd rows of an interlaced picture are of another moment, in which the board stood d pixels beside: their
+    light is off by -d times its slope m_x. Four rows tell m_x, and by (1, -3, 3, -1) / 8 half of what odd
+    rows are off by, whatever slope the light has down the picture.
+    """
+    height, width = gray.shape
+    rows, columns = (n // cells * cells for n, cells in zip((height // 4, width), _GRID, strict=True))
+    if min(rows, columns) == 0:
+        return gray
+    every = 1 + rows * columns * 4 // _FIELD_PIXELS
+    # Columns have neighbours, so rows are left out.
+    quads = gray[: 4 * rows, :columns].reshape(_GRID[0], -1, 4, columns)[:, ::every].astype(np.float32)
+    off = 2.0 * np.einsum("gnrx,r->gnx", quads, np.array([1.0, -3.0, 3.0, -1.0], dtype=np.float32) / 8.0)
+    mean = np.einsum("gnrx,r->gnx", quads, np.array([1.0, 3.0, 3.0, 1.0], dtype=np.float32) / 8.0)
+    slope = np.gradient(mean, axis=2)
+    both, squares, offs = (
+        cells.reshape(*cells.shape[:2], _GRID[1], -1).sum(axis=(1, 3))
+        for cells in (off * slope, slope**2, off**2)
+    )
+    sloping = squares > _LEAST_SLOPE**2 * (off.size / (_GRID[0] * _GRID[1]))
+    moved = sloping & (both**2 > _SHARE * squares * offs) & (abs(both) > _MOVED_PX * squares)
+    if max(np.count_nonzero(moved & (both > 0.0)), np.count_nonzero(moved & (both < 0.0))) < _FEWEST:
+        return gray
+    even = gray[::2].astype(np.float32)
+    around = np.pad(even, ((1, 2), (0, 0)), mode="edge")
+    between = (9.0 * (around[1:-2] + around[2:-1]) - around[:-3] - around[3:]) / 16.0
+    whole = gray.copy()
+    whole[1::2] = np.clip(np.rint(between[: height // 2]), 0, 255)
+    return whole
 
 
 def usual_size(pictures: Sequence[Picture]) -> tuple[int, int]:

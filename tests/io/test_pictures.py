@@ -71,6 +71,22 @@ def test_a_raw_picture_is_read_without_its_mosaic(project_root: Path, tmp_path: 
     np.testing.assert_array_equal(gray, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
 
 
+@pytest.mark.parametrize("moved_px", [-3.0, 1.0, 6.0])
+def test_an_interlaced_picture_is_read_as_its_first_field(
+    project_root: Path, tmp_path: Path, moved_px: float
+) -> None:
+    """The odd rows of the board that moved are as the even ones say, to a tenth of a pixel."""
+    gray = read_picture(project_root / "images" / "view03.png").gray
+    step = np.array([[1.0, 0.0, moved_px], [0.0, 1.0, 0.0]])
+    woven = gray.copy()
+    woven[1::2] = cv2.warpAffine(gray, step, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)[1::2]
+    cv2.imwrite(str(tmp_path / "woven.png"), woven)
+    whole, field = (detect(one, 7, 5) for one in (gray, read_picture(tmp_path / "woven.png").gray))
+    assert whole is not None and field is not None
+    np.testing.assert_allclose(field.pixels, whole.pixels, atol=0.15)
+    assert abs(np.mean(field.pixels - whole.pixels)) < 0.01
+
+
 def test_exif_orientation_is_left_alone(tmp_path: Path) -> None:
     plain = _jpg(GRAY)
     exif = (
