@@ -123,6 +123,8 @@ def delay_of(
 # up for it. Clocks that seem to drift by more than clocks do are swings that are held against others.
 
 _STEP_S, _OVER = 0.01, 10
+_PARTS = np.arange(-4, 5) / 5.0
+_WEIGHTS = (1.0 - np.abs(_PARTS)) / 5.0
 _GAP_S = 0.15
 _MOST_LEFT, _APART, _ROUGHLY_APART = 0.4, 0.5, 0.95
 """Share of the motion that may be left, and of what the next best delay leaves, without and with a factor."""
@@ -154,12 +156,23 @@ class Clocks:
     next_left: float
 
 
-def _on_grid(t_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Times of a grid, rates there, and whether they are between samples that are close together."""
+def _on_grid(
+    t_s: FloatArray, values: FloatArray, others_s: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Times of a grid, rates there, and whether they are between samples that are close together.
+
+    Straight lines between the other record's samples (at `others_s`) weigh what happens between them by a
+    triangle, as wide as two of its steps, and so are these values: else its motion is the smaller one, as
+    that of a swing is a period later.
+    """
     at = np.arange(t_s[0], t_s[-1], _STEP_S)
     after = np.clip(np.searchsorted(t_s, at, side="right"), 1, len(t_s) - 1)
     near = t_s[after] - t_s[after - 1] < _GAP_S
-    smooth = np.interp(at, t_s, values)
+    step_s = float(np.median(np.diff(others_s)))
+    smooth = sum(
+        weight * np.interp(at + part * step_s, t_s, values)
+        for part, weight in zip(_PARTS.tolist(), _WEIGHTS.tolist(), strict=True)
+    )
     rate = (smooth[_OVER:] - smooth[:-_OVER]) / (_OVER * _STEP_S)
     middle = _OVER // 2
     return at[middle : middle + len(rate)], rate, near[_OVER:] & near[:-_OVER]
@@ -197,8 +210,8 @@ def clocks(
     camera_s, way : (n,) times and angle phi [rad], or with `scaled` False any measure of the motion.
     imu_s, gz_radps : (m,) times and rates.
     """
-    at, seen, known = _on_grid(camera_s, way)
-    felt_s, felt, _ = _on_grid(imu_s, -integral(imu_s, gz_radps - np.median(gz_radps)))
+    at, seen, known = _on_grid(camera_s, way, imu_s)
+    felt_s, felt, _ = _on_grid(imu_s, -integral(imu_s, gz_radps - np.median(gz_radps)), camera_s)
     if known.sum() < 10 * _OVER or len(felt) < 10 * _OVER:
         return None
 

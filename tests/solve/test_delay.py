@@ -48,19 +48,21 @@ def _swing(t: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("scale", "seen_s", "felt_s", "drift", "told"),
+    ("scale", "seen_s", "felt_s", "drift", "told", "rate_hz"),
     [
-        (1.0, 0.1, 0.0, 0.0, True),
-        (1.0, 0.1, 0.0, 2e-4, True),
-        (1.0, 0.3, 0.75, 0.0, False),
-        (0.85, 0.35, 0.35, 0.0, False),
+        (1.0, 0.1, 0.0, 0.0, True, 60.0),
+        (1.0, 0.1, 0.0, 2e-4, True, 60.0),
+        (1.0, 0.3, 0.75, 0.0, False, 60.0),
+        (0.85, 0.35, 0.35, 0.0, False, 60.0),
+        (1.0, 0.1, 0.0, 0.0, True, 12.0),
+        (1.0, 0.31, 0.31, 0.0, True, 15.0),
     ],
 )
 def test_a_swing_is_not_taken_for_the_one_a_period_later(
-    scale: float, seen_s: float, felt_s: float, drift: float, told: bool
+    scale: float, seen_s: float, felt_s: float, drift: float, told: bool, rate_hz: float
 ) -> None:
     rng = np.random.default_rng(2)
-    board, seen = np.arange(felt_s, 6.0, 0.01), np.arange(seen_s, 6.0, 1.0 / 60.0)
+    board, seen = np.arange(felt_s, 6.0, 0.01), np.arange(seen_s, 6.0, 1.0 / rate_hz)
     way = scale * _swing(seen) + 0.002 * rng.normal(size=len(seen))
     rates = -(_swing(board + 1e-4) - _swing(board - 1e-4)) / 2e-4 + 0.005 * rng.normal(size=len(board))
     found = clocks((1.0 + drift) * seen - 50.0, way, board, rates, True)
