@@ -8,6 +8,7 @@ import subprocess
 
 import pytest
 import yaml
+from firmware_build import need
 
 from calib.stages.firmware.header import VERBATIM
 
@@ -130,6 +131,7 @@ def test_a_sketch_without_the_guard_is_named_and_does_not_compile(calib, rig, tm
     told = calib("firmware", "--rig", rig, "-o", out).err
     assert "left as it is" in told and "has no guard, so that nothing stops the pumps" in told
     assert sketch.read_text() == old
+    need("gcc")
     words = ["gcc", "-fsyntax-only", "-x", "c", "-DCALIB_EXPECT_SCHEMA=3", str(out / "calib_constants.h")]
     compiled = subprocess.run(words, capture_output=True, text=True, check=False)
     assert compiled.returncode != 0 and "schema" in compiled.stderr
