@@ -194,6 +194,8 @@ def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
             )
     if rows:
         say_table(["constant", "median", "spread", "outliers", "drift per number"], rows)
+    if summary.remark:
+        say(summary.remark[0].lower() + summary.remark[1:-1])
     for look in summary.looks[:_MOST_TOLD]:
         say(f"look at {look.name}: {look.verdict}{', ' if look.why else ''}{look.why}")
     if summary.to_look_at > _MOST_TOLD:

@@ -937,6 +937,12 @@ class FleetSummary:
     numbered: int
     limit: float
 
+    @property
+    def remark(self) -> str:
+        """A sentence where no rig could be compared with the others, else nothing."""
+        few = not math.isfinite(self.limit)
+        return f"No rig is compared with the others: fewer than {FEWEST} have a result." * few
+
 
 def judged_names(names: tuple[str, ...]) -> list[str]:
     """Constants that rigs are compared by: not the elements of matrices, and not what a person has chosen."""
@@ -958,7 +964,9 @@ def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
     listed = [name for name in wanted if _varies(column(table, name))]
     rigs = len(names)
     worst, of = np.full(rigs, np.nan), np.full(rigs, -1, dtype=np.int32)
-    limit = limit_of(rigs, len(listed)) if rigs >= FEWEST else float("nan")
+    # A rig without a result, or without this stage, is none that others are compared with.
+    most = max((int(np.isfinite(column(table, name)).sum()) for name in listed), default=0)
+    limit = limit_of(most, len(listed)) if most >= FEWEST else float("nan")
     constants = []
     for index, name in enumerate(listed):
         x, sigma = column(table, name), column(table, f"{name}.sigma")

@@ -134,8 +134,9 @@ def _answer(summary: FleetSummary) -> tuple[str, str]:
         drift = "drifts" if len(drifting) == 1 else "drift"
         parts.append(f"{several(drifting, 3)} {drift} with the serial number")
     if not parts:
-        one = summary.rigs == 1
-        return "yes", "the rig is ok" if one else f"all {summary.rigs} rigs are ok, and none stands out"
+        if summary.rigs == 1:
+            return "yes", "the rig is ok"
+        return "yes", f"all {summary.rigs} rigs are ok{'' if summary.remark else ', and none stands out'}"
     return ("no" if bad else "not-yet"), "; ".join(parts)
 
 

@@ -151,6 +151,15 @@ def test_outliers_drift_and_looks() -> None:
     assert found.numbered == 120
 
 
+def test_few_results_are_not_compared() -> None:
+    """Seven rigs with a result beside one without: nobody can say that none stands out."""
+    found = summarise(table_of(_fleet(8)))[0]
+    assert found.verdicts["failed"] == 1 and found.constants[0].spread.count == 7
+    assert np.isnan(found.limit)
+    assert found.remark == "No rig is compared with the others: fewer than 8 have a result."
+    assert not _summary(40).remark
+
+
 def test_its_size_does_not_grow_with_the_fleet() -> None:
     for count in (40, 2000):
         found = _summary(count)
