@@ -89,7 +89,7 @@ def live(
     before = set(album.logs.glob("*.csv"))
 
     def ready(address: str) -> None:
-        narrate(f"open {address}; Done on the page, or Ctrl-C, ends it")
+        narrate(f"Done on the page, or Ctrl-C, ends it; open {address}")
         if browser:
             import webbrowser
 

@@ -355,8 +355,10 @@ class Live:
 
     def _go(self, asked: dict[str, Any]) -> None:
         step = asked.get("name")
-        if step not in STEPS or (step == "board" and self.board is None):
+        if step not in STEPS:
             raise BadInputError("there is no such step")
+        if step == "board" and self.board is None:
+            raise BadInputError("no board is connected: start calib live with --port, as --port /dev/ttyUSB0")
         if step == "plane" and self.rig.camera is None:
             raise BadInputError("the camera comes first: take its pictures")
         self._held(self._set, step)

@@ -601,6 +601,8 @@ def test_a_marker_is_recorded_while_one_looks_at_it(tmp_path: Path) -> None:
     scene = Scene(other="disc", noise=2.0, rate_hz=30.0)
     with served(tmp_path / "rig") as live, tab(live) as line:
         line.send('{"do": "camera", "size": [640, 480]}')
+        line.send('{"do": "step", "name": "board"}')
+        assert "No board is connected: start calib live with --port" in heard(line, "fault")["says"]
         line.send('{"do": "step", "name": "marker"}')
         wait(lambda: live.step == "marker")
         log = tmp_path / "rig" / "logs" / "track1.csv"
