@@ -237,3 +237,15 @@ def test_an_answer_that_a_spoilt_column_put_off_is_not_ok(
                 believed.append(f"{name}, {which}: {away:.1f} deviations")
     print(f"{verb}: {told} of {count} told")
     assert not believed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["replay", "smooth"])
+def test_motion_that_jumps_at_random_is_no_fault(
+    verb: str, logs: dict[str, Log], rig: Rig, tmp_path: Path
+) -> None:
+    """The model without commands put a scale of the accelerometer 4 deviations off, which was poor."""
+    rig.save(tmp_path / "rig.yaml")
+    answer = _answer(verb, [logs["prbs"]], rig, tmp_path)
+    assert answer.word == "ok"
+    assert answer.off < 2.0
