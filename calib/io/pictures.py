@@ -31,11 +31,13 @@ from calib.core.files import PICTURES, read_bytes, sha256, shown, to_be
 # the headers but for HEIF (ISO/IEC 23008-12) and for TIFF 6.0 and BigTIFF, of which it declines some kinds.
 
 _BY_PILLOW = ("PNG", "JPEG", "BMP", "WEBP", "PPM")
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _MOST_TAGS = 1000
 _HEIF_BYTES = 1_000_000
 """Within so many bytes properties are looked for."""
+_ANIMATION_BYTES, _MOST_PAGES = 10_000, 1000
 
 
 def declared_pixels(data: bytes) -> int | None:
@@ -51,7 +53,7 @@ def declared_size(data: bytes) -> tuple[int, int]:
         found = re.findall(rb"ispe.{4}(.{4})(.{4})", data[:_HEIF_BYTES], re.DOTALL)
         sizes = [(int.from_bytes(w), int.from_bytes(h)) for w, h in found]
         return max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
-    if data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+    if data[:4] in _TIFF:
         try:
             return _tiff_size(data)
         except (struct.error, OverflowError, KeyError):
@@ -89,6 +91,33 @@ def _tiff_size(data: bytes) -> tuple[int, int]:
     return int(found[_TIFF_WIDTH]), int(found[_TIFF_HEIGHT])
 
 
+def count_pictures(data: bytes) -> int:
+    """How many pictures of one size a file holds, as frames or pages; 1 where nobody can say."""
+    if data.startswith(_PNG):
+        at = data.find(b"acTL", 0, _ANIMATION_BYTES)
+        return max(int.from_bytes(data[at + 4 : at + 8]), 1) if at >= 0 else 1
+    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+        return max(data.count(b"ANMF"), 1)
+    if data[:4] not in _TIFF:
+        return 1
+    from PIL import Image
+
+    try:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(data), formats=("TIFF",)) as image,
+        ):
+            size, same = image.size, 1
+            for page in range(1, min(getattr(image, "n_frames", 1), _MOST_PAGES)):
+                image.seek(page)
+                # Others are thumbnails and the steps of a pyramid.
+                same += image.size == size
+            return same
+    except Exception:
+        # Damaged bytes make its reader raise nearly anything.
+        return 1
+
+
 # ----------------------------------------------------------------------
 # Picture files: which there are, whether they are whole, and their pixels as grey values.
 #
@@ -122,12 +151,14 @@ class Picture:
     sha256 : of the file.
     gray : (height, width) grey values; (0, 0) of a picture whose header alone was read.
     size_px : width and height.
+    count : of pictures in the file, of which this is the first.
     """
 
     name: str
     sha256: str
     gray: GrayImage
     size_px: tuple[int, int]
+    count: int = 1
 
 
 def _natural(path: Path) -> tuple[object, ...]:
@@ -210,7 +241,7 @@ def read_picture(path: Path, pixels: bool = True) -> Picture:
         width, height = declared_size(data)
         if 0 < width * height <= _MAX_PIXELS:
             nothing = np.empty((0, 0), dtype=np.uint8)
-            return Picture(shown(path.name), sha256(data), nothing, (width, height))
+            return Picture(shown(path.name), sha256(data), nothing, (width, height), count_pictures(data))
     return decoded_picture(data, shown(path), shown(path.name), sha256(data))
 
 
@@ -242,7 +273,7 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     if decoded is None or decoded.size == 0:
         raise BadInputError(f"{where}: is not a picture that can be decoded")
     height, width = decoded.shape[:2]
-    return Picture(name, digest, eight_bits(decoded), (width, height))
+    return Picture(name, digest, eight_bits(decoded), (width, height), count_pictures(data))
 
 
 def is_heic(data: bytes) -> bool:

@@ -174,6 +174,14 @@ def test_a_board_under_a_thumb_in_every_picture(shipped: list[Path], tmp_path: P
     assert [one.name for one in covered.left_out] == [shipped[2].name]
 
 
+def test_a_file_of_several_pictures_is_named(shipped: list[Path], tmp_path: Path) -> None:
+    pages = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in shipped[:3]]
+    assert cv2.imwritemulti(str(tmp_path / "all.tiff"), pages)
+    found = find_boards([tmp_path / "all.tiff"], (7, 5), 0.02)
+    assert [view.name for view in found.views] == ["all.tiff"]
+    assert "all.tiff: holds 3 pictures, of which the first alone is read" in str(found.left_out[0])
+
+
 def test_damaged_pictures_are_named(shipped: list[Path], tmp_path: Path) -> None:
     copies = [Path(shutil.copy(path, tmp_path)) for path in shipped[:6]]
     whole = copies[1].read_bytes()

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from calib.core.errors import BadInputError
-from calib.io.pictures import declared_pixels, list_pictures, read_picture
+from calib.io.pictures import count_pictures, declared_pixels, list_pictures, read_picture
 from calib.stages.camera.corners import detect
 
 GRAY = (np.add.outer(np.arange(40), np.arange(60)) * 2).astype(np.uint8)
@@ -85,6 +86,21 @@ def test_an_interlaced_picture_is_read_as_its_first_field(
     assert whole is not None and field is not None
     np.testing.assert_allclose(field.pixels, whole.pixels, atol=0.15)
     assert abs(np.mean(field.pixels - whole.pixels)) < 0.01
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "WEBP"])
+def test_pictures_of_a_file_are_counted(tmp_path: Path, kind: str) -> None:
+    """Frames of an animation and pages; a thumbnail, which is smaller, is none."""
+    one, other = (Image.fromarray(gray) for gray in (GRAY, GRAY[::-1].copy()))
+    file = tmp_path / "several"
+    one.save(file, kind, save_all=True, append_images=[other, one])
+    assert count_pictures(file.read_bytes()) == 3
+    one.save(file, kind)
+    assert count_pictures(file.read_bytes()) == 1
+    if kind == "TIFF":
+        one.save(file, kind, save_all=True, append_images=[one.resize((6, 4))])
+        assert count_pictures(file.read_bytes()) == 1
+    assert count_pictures(file.read_bytes()[:20]) == 1
 
 
 def test_exif_orientation_is_left_alone(tmp_path: Path) -> None:

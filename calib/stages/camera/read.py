@@ -205,6 +205,7 @@ def find_boards(
         else without.get(one.name)
         for path, one in read.items()
     ]  # fmt: skip
+    left_out += [_of_several(one) for one in pictures.values() if one.count > 1]
     return replace(
         search,
         left_out=tuple(one for one in left_out if one is not None),
@@ -221,6 +222,11 @@ def _of_another_size(picture: Picture, size_px: tuple[int, int], others: int) ->
     turned = ", as if turned by a quarter" if (width, height) == (h, w) else ""
     why = f"is {width}x{height} px{turned}; {others} others are {w}x{h} px"
     return LeftOut(picture.name, why, "size")
+
+
+def _of_several(picture: Picture) -> LeftOut:
+    why = f"holds {picture.count} pictures, of which the first alone is read: write each to a file of its own"
+    return LeftOut(picture.name, why, "file")
 
 
 def _headed(path: Path) -> Picture | BadInputError:
