@@ -14,6 +14,7 @@ from identifytrials import SIGMA, log_file, rig_file, track, varied
 import calib
 from calib.core.errors import BadInputError
 from calib.core.options import PoseOptions
+from calib.core.rig import Rig
 from calib.core.stage import Files
 from calib.io.logs import Log, read_log, write_log
 from calib.stages.actuator.identify import (
@@ -712,6 +713,21 @@ def test_a_command_that_is_written_where_it_changes_holds(folder: Path, least: i
     assert held.tick_s == pytest.approx(1 / 60)
     differ = np.any(told.pwm[: len(held.pwm)] != held.pwm[: len(told.pwm)], axis=1)
     assert differ.mean() < 0.02
+
+
+def test_a_command_that_is_spoilt_is_left_out_and_many_are_refused(folder: Path) -> None:
+    log = read_log(folder / "prbs.csv")
+    whole, rows = _read(folder, "prbs.csv"), log.sampled("pwm1", "pwm2")
+    pwm = log.columns["pwm1"].copy()
+    pwm[rows[100]] = 300.0
+    one, files = _changed(folder, "prbs.csv", pwm1=pwm.copy()), Files((), folder / "rig.yaml")
+    held = read_track(files, one, Rig.load(files.rig_path), Machine(), PoseOptions())
+    assert any("300.0" in text and "1 of" in text and "left out" in text for text in files.remarks)
+    assert held.pwm.max() <= 255.0
+    assert np.any(held.pwm != whole.pwm, axis=1).sum() <= 1
+    pwm[rows[::50]] = 300.0
+    with pytest.raises(BadInputError, match=r"line \d+: pwm is \[300\.0, .*expected 0 to 255$"):
+        _read(folder, _changed(folder, "prbs.csv", pwm1=pwm).name)
 
 
 def test_pictures_that_share_their_time_stamps_are_refused(folder: Path) -> None:

@@ -261,6 +261,8 @@ _MOST_TICKS = 10_000_000
 _LONGEST_TICK_S = 0.1
 """No loop that drives a pump is slower."""
 _LATE_S = 0.01
+_SPOILT = 0.01
+"""Share of commands up to which those out of range are cells that were spoilt on their way."""
 _SHARED = 0.25
 """Share of pictures whose time is that of the one before, where a clock's steps could not be followed."""
 _TRUE_SIGMA = (1e-4, 1e-5)
@@ -352,8 +354,8 @@ def _check_clock(log: Log) -> None:
         )
 
 
-def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
-    """Time of the first tick, tick and commands (n, 2) held to an even grid."""
+def _commands(log: Log, no_pwm: bool, said: list[str]) -> tuple[float, float, FloatArray]:
+    """Time of the first tick, tick and commands (n, 2) held to an even grid; adds sentences to `said`."""
     end = float(log.t_s[-1])
     if not len(log.sampled("pwm1", "pwm2")):
         if not no_pwm:
@@ -369,12 +371,14 @@ def _commands(log: Log, no_pwm: bool) -> tuple[float, float, FloatArray]:
         return begin, TICK_S, np.zeros((max(math.ceil((end - begin) / TICK_S) + 1, 2), 2))
     commands = log.signals("pwm1", "pwm2")
     t, pwm = commands.t_s, commands.values
-    wrong = np.nonzero(((pwm < 0.0) | (pwm > 255.0)).any(axis=1))[0]
-    if len(wrong):
-        k = int(wrong[0])
-        raise BadInputError(
-            f"{log.source}, line {commands.lines[k]}: pwm is {pwm[k].tolist()}, expected 0 to 255"
-        )
+    wrong = ((pwm < 0.0) | (pwm > 255.0)).any(axis=1)
+    if wrong.any():
+        k, count = int(np.argmax(wrong)), int(wrong.sum())
+        found = f"{log.source}, line {commands.lines[k]}: pwm is {pwm[k].tolist()}, expected 0 to 255"
+        if count > _SPOILT * len(pwm):
+            raise BadInputError(found)
+        said.append(f"{found}; {count} of {len(pwm)} commands are such and are left out")
+        t, pwm = t[~wrong], pwm[~wrong]
     if 0.0 < float(pwm.max()) <= 1.0:
         raise BadInputError(
             f"{log.source}: pwm1 and pwm2 are {float(pwm.max()):.3g} at most, expected 0 to 255; where they "
@@ -458,7 +462,7 @@ def read_track(
     said = files.remarks
     log = read_log(path, options, said, rig.picture_px)
     _check_clock(log)
-    begin, tick_s, pwm = _commands(log, options.no_pwm)
+    begin, tick_s, pwm = _commands(log, options.no_pwm, said)
     delay_s = 0.0
     if states is None and not options.truth and not len(log.sampled("u_px", "v_px")):
         states = states_beside(path)
