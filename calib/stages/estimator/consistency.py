@@ -14,6 +14,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from calib.core.arrays import FloatArray, robust_sigma
 from calib.core.result import finite_or_none
@@ -28,6 +29,10 @@ SETTLED_S = 2.0
 _LEVEL = 0.95
 _TOGETHER, _CLIPPED = 6, 6.0
 """Pictures whose innovations are summed up to find a jump, and where each of them is cut."""
+_BACK_S, _AROUND, _FOLLOWED, _MOST_JUMPS, _NO_JUMP = 2.0, 25, 2.0, 20, 4.0
+"""What jumps back within this time was no camera that moved; pictures whose motion a step stands out of;
+innovations are below the third where the filter has followed a jump; jumps that are looked at in a block;
+sums that are none."""
 
 
 def chi_square_band(degrees: int, draws: int) -> tuple[float, float]:
@@ -55,6 +60,30 @@ def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m
     return np.asarray((sp**2 * e_l**2 - 2.0 * cross * e_l * e_p + var_l * e_p**2) / determinant)
 
 
+def _back_again(t_s: FloatArray, e: FloatArray, readings: FloatArray, k: int) -> int | None:
+    """Index from which on a jump of the readings at `k` is undone; None where it stays.
+
+    They change back then, by half as much or more, and so do the innovations, which alone do when a filter
+    follows a jump.
+    """
+    first, end = max(k - _TOGETHER, 0), int(np.searchsorted(t_s, t_s[k] + _BACK_S))
+    back = np.ones(max(end - first - 5, 0), dtype=np.bool_)
+    for values in (readings[first:end], e[first:end]):
+        # From the mean of three to that of the next three; beside what moves all the time.
+        means = np.convolve(values, np.ones(3) / 3, "valid")
+        changes = means[3:] - means[:-3]
+        changes = changes - median_filter(changes, _AROUND)
+        at = min(k - first - 3, len(changes) - 1)
+        back &= changes * changes[at] < -0.5 * changes[at] ** 2
+    later = np.flatnonzero(back[max(k - first - 2, 0) :])
+    if not len(later):
+        return None
+    j = k + 1 + int(later[-1])
+    while j < len(e) and (e[j : j + 3] * e[k] < -_FOLLOWED * abs(e[k])).any():
+        j += 1
+    return j
+
+
 @dataclass
 class Tally:
     """Sums over the rows of a log, block after block; rows of the first two seconds do not count."""
@@ -72,8 +101,12 @@ class Tally:
     jump: tuple[float, float] = (0.0, math.nan)
     """Where the pictures jump most, in deviations of what innovations sum up to, and when [s]."""
 
-    def add(self, out: FloatArray, truth: FloatArray | None = None) -> None:
-        """Rows of `kinematic.OUT`, and (n, 3) true q1, q2, phi, NaN where not known."""
+    def add(
+        self, out: FloatArray, truth: FloatArray | None = None, marker_px: FloatArray | None = None
+    ) -> None:
+        """Rows of `kinematic.OUT`, (n, 3) true q1, q2, phi, NaN where not known, and (n, 2) readings of the
+        camera, without which no jump of theirs is looked for.
+        """
         if len(out) == 0:
             return
         if self.rows == 0:
@@ -86,7 +119,8 @@ class Tally:
         late = out[:, 0] >= self.start_s + SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])
-        self._add_jump(out[late])
+        if marker_px is not None:
+            self._add_jump(out[late], marker_px[late])
         if truth is not None:
             self._add_truth(out[late], truth[late])
 
@@ -109,20 +143,29 @@ class Tally:
             sums[5 + 2 * k] += float((e[1:] ** 2).sum())
             last[place] = e[-1]
 
-    def _add_jump(self, out: FloatArray) -> None:
+    def _add_jump(self, out: FloatArray, marker_px: FloatArray) -> None:
         """Innovations of a camera that was moved are alike until the filter has followed it.
 
         With those that were gated out, and over what such sums are in this log, which wrong constants raise.
+        A reflection that is taken for the marker for a while is none: the pictures jump back.
         """
-        seen = out[np.isfinite(out[:, OUT.index("gated_camera")])]
-        e = seen[:, [OUT.index(column) for column in _INNOVATIONS["camera"]]]
-        if len(e) < 10 * _TOGETHER:
+        seen = np.isfinite(out[:, OUT.index("gated_camera")])
+        if np.count_nonzero(seen) < 10 * _TOGETHER:
             return
-        e = np.clip(np.nan_to_num(e), -_CLIPPED, _CLIPPED)
-        for sums in np.lib.stride_tricks.sliding_window_view(e, _TOGETHER, axis=0).sum(axis=2).T:
-            size = np.abs(sums) / max(robust_sigma(sums), math.sqrt(_TOGETHER))
-            k = int(np.argmax(size))
-            self.jump = max(self.jump, (float(size[k]), float(seen[k, 0])))
+        t_s = out[seen, 0]
+        for column, readings in zip(_INNOVATIONS["camera"], marker_px[seen].T, strict=True):
+            e = np.nan_to_num(out[seen, OUT.index(column)])
+            for _ in range(_MOST_JUMPS):
+                sums = np.convolve(np.clip(e, -_CLIPPED, _CLIPPED), np.ones(_TOGETHER), "valid")
+                size = np.abs(sums) / max(robust_sigma(sums), math.sqrt(_TOGETHER))
+                k = int(np.argmax(size))
+                if size[k] <= max(self.jump[0], _NO_JUMP):
+                    break
+                back = _back_again(t_s, e, readings, k)
+                if back is None:
+                    self.jump = float(size[k]), float(t_s[k])
+                    break
+                e[k:back] = 0.0
 
     def _add_truth(self, out: FloatArray, truth: FloatArray) -> None:
         known = np.isfinite(truth).all(axis=1)

@@ -430,12 +430,20 @@ class Sums:
     weighed: int = 0
     driven: int = 0
 
-    def add(self, out: FloatArray, truth: FloatArray | None, held: FloatArray | None = None) -> None:
-        """Rows that follow, with the truth (n, 3) and rows of the baseline where there are any."""
+    def add(
+        self,
+        out: FloatArray,
+        truth: FloatArray | None,
+        held: FloatArray | None = None,
+        marker_px: FloatArray | None = None,
+    ) -> None:
+        """Rows that follow, with the truth (n, 3), rows of the baseline and readings (n, 2) of the camera
+        where there are any.
+        """
         weight = out[:, OUT.index("driven_weight")]
         self.weighed += int(np.isfinite(weight).sum())
         self.driven += int(np.count_nonzero(weight >= 0.5))
-        self.fused.add(out, truth)
+        self.fused.add(out, truth, marker_px)
         if held is not None:
             self.baseline.add(_as_out(held), truth)
         if self.trace is not None:
@@ -874,7 +882,7 @@ def _stream(
         if baseline is not None and (truth is not None or sums.trace is not None or not fused):
             held = baseline.run(rows)
         sums.watch.add(block)
-        sums.add(out, truth, held)
+        sums.add(out, truth, held, rows.readings[:, :2])
         if fused or held is None:
             write(out[:, _COLUMNS])
         else:
