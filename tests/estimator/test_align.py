@@ -19,6 +19,7 @@ from calib.core.rig import Geometry, Rig
 from calib.io.logs import Log, unclipped
 from calib.stages.align.join import joined
 from calib.stages.align.plots import plots
+from calib.stages.align.read import align_log as read_for_alignment
 from calib.stages.align.read import settings_from_rig
 from calib.stages.align.section import Align
 from calib.stages.align.solve import (
@@ -743,3 +744,28 @@ def test_logs_of_one_clock_are_merged_as_they_are() -> None:
         joined(board, board, Rig(), "rig.yaml", 0.0)
     with pytest.raises(BadInputError, match="none of its pictures is within the time"):
         joined(replace(camera, t_s=camera.t_s + 1e6), board, Rig(), "rig.yaml", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "every", "words"),
+    [
+        ("ellipse", 1, ""),
+        ("ellipse", 3, "in one of 3 cells"),
+        ("swing", 1, ""),
+        ("swing", 0, "repeat where it"),
+    ],
+)
+def test_cells_that_hold_the_last_place_of_the_marker_are_named(name: str, every: int, words: str) -> None:
+    """`every` cells hold one picture; 0 of them all rows do, as of a recorder that writes all columns."""
+    log = twin_log(SimulatedRig(), name, {}, 3, 12.0)
+    columns, rows = dict(log.columns), log.sampled("u_px", "v_px")
+    for column in ("u_px", "v_px"):
+        held = columns[column].copy()
+        if every:
+            held[rows] = held[rows[np.arange(len(rows)) // every * every]]
+        else:
+            held = held[rows[np.maximum(np.searchsorted(rows, np.arange(len(log)), side="right") - 1, 0)]]
+        columns[column] = held
+    _, remarks = read_for_alignment(replace(log, columns=columns))
+    assert len(remarks) == bool(words)
+    assert all("leave u_px and v_px blank" in text and words in text for text in remarks)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.logs import Log, unclipped
+from calib.io.logs import Log, held_places, unclipped
 from calib.stages.align.solve import AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import QUANTITIES, sensor_values, view_coefficients
@@ -46,7 +46,9 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
         if name in imu.names:
             readings[:, k] = imu[name]
     both = np.isfinite(readings[:, :2]).all(axis=1)
-    remarks = [f"{log.source}: {one}" for one in log.passed.sentences if one not in heard.sentences]
+    held = held_places(log)
+    remarks = [f"{log.source}: {held}; leave u_px and v_px blank where no picture is new"] if held else []
+    remarks += [f"{log.source}: {one}" for one in log.passed.sentences if one not in heard.sentences]
     if not both.any():
         remarks.append(f"{log.source}: has no accelerometer; the mount angle stays unknown")
     else:
