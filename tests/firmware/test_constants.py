@@ -168,7 +168,12 @@ def test_cppcheck_finds_what_the_manual_gives_reasons_for(tmp_path: Path) -> Non
             own, cwd=tmp_path, capture_output=True, text=True, check=False
         ).stderr.splitlines()
     misra = {line.split()[0].removeprefix("misra-c2012-") for line in found if line.startswith("misra")}
-    assert not [line for line in found if not line.startswith("misra") and " style " not in line]
+    # Newer ones tell besides how many branches they look at.
+    assert not [
+        line
+        for line in found
+        if not line.startswith(("misra", "normalCheckLevelMaxBranches")) and " style " not in line
+    ]
     page = resources.files("calib.docs").joinpath("howto/wire-and-flash.md").read_text("utf-8")
     assert misra == set(re.findall(r"^\| (\d+\.\d+) \|", page, re.M))
 
