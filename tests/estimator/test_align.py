@@ -184,22 +184,27 @@ def test_a_swing_of_four_pictures_in_a_period_is_aligned() -> None:
 
 
 @pytest.mark.parametrize(
-    ("turned_deg", "bias_radps", "words", "word"),
+    ("turned_deg", "bias_radps", "late_s", "words", "word"),
     [
-        (0.0, 0.0, "", "ok"),
-        (0.3, 0.0, "ellipse1: the mount angle differs", "poor"),
-        (0.0, 0.01, "ellipse1: the gyroscope's bias differs from that in the other logs by +0.010", "ok"),
+        (0.0, 0.0, 0.0, "", "ok"),
+        (0.3, 0.0, 0.0, "ellipse1: the mount angle differs", "poor"),
+        (0.0, 0.01, 0.0, "gyroscope's bias differs from that in the other logs by +0.010", "ok"),
+        (0.0, 0.0, 0.003, "swing0: the time offset differs from that in the other logs by +0.003", "poor"),
     ],
 )
 def test_sigma_holds_what_is_another_in_one_log(
-    turned_deg: float, bias_radps: float, words: str, word: str
+    turned_deg: float, bias_radps: float, late_s: float, words: str, word: str
 ) -> None:
-    """What put the angle at rest 5 deviations off, mounted anew in one log, or the bias 30, is in sigma."""
+    """What put the angle at rest 5 deviations off, mounted anew in one log, or the bias 30, is in sigma.
+
+    So is a log that was joined otherwise than the others.
+    """
     trial = known(SimulatedRig())
     logs = [align_log(twin_log(trial.rig, name, options, k)) for k, (name, options) in enumerate(MOTIONS)]
     c, s = math.cos(math.radians(turned_deg)), math.sin(math.radians(turned_deg))
     readings = logs[1].readings @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     logs[1] = replace(logs[1], readings=readings + np.array([0.0, 0.0, bias_radps]))
+    logs[0] = replace(logs[0], camera_s=logs[0].camera_s + late_s)
     found = align(logs, prior_settings(trial.view))
     verdict = judge(found)
     assert verdict.word == word

@@ -905,7 +905,8 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 #
 # The covariance is that of the fit plus that of biases that have walked by K sqrt(T / 3) in the mean of a
 # log, and of those that in one log are not what they are in the others: of a sensor that was mounted anew or
-# was warmer, of a camera that was moved. To add d to a quantity in one log, which changes its readings by J,
+# was warmer, of a camera that was moved, or, of the time offset, of a log that was joined to its camera's by
+# itself. To add d to a quantity in one log, which changes its readings by J,
 # has the score g = J' W e and the information I, J' W J less what motion and s explain; d = g / I.
 # At rest the mount angle and the bias along y are one number,
 #
@@ -1105,8 +1106,10 @@ _MAY_DIFFER = {
     "accel_bias_y_mps2": 0.01,
     "gyro_bias_radps": 1e-3,
     "mount_angle_rad": 1e-3,
+    "time_offset_s": 5e-4,
 }
-"""Deviations, and amounts, from which on a log has its own: 0.001 rad and 0.01 m/s^2 are 0.06 degrees. Four
+"""Deviations, and amounts, from which on a log has its own: 0.001 rad and 0.01 m/s^2 are 0.06 degrees, and
+logs that were joined to their camera's differ by up to 3 ms, of one clock by less than 2 deviations. Four
 logs of one rig come to 2.4 deviations at most, in 32 alignments of other plants, noise, rates and outliers;
 of stamps in steps of 10 ms to 8.9, for 9e-4 rad/s."""
 _TOLD = 1e-3
@@ -1139,8 +1142,7 @@ def _apart(problem: Problem, fit: Fit, logs: int) -> list[Apart]:
             if stretch.log != log:
                 continue
             to_c = np.zeros(c.size)
-            for off, rows in _readings(stretch, c, fit.sensor):
-                _, pull, weight = imu_terms(off, fit.noise.imu)
+            for rows, pull, weight in _terms(problem, fit, stretch, c, name):
                 change = rows.by[:, :, at]
                 score += float((pull * change).sum())
                 alone += float((weight * change**2).sum())
@@ -1154,6 +1156,20 @@ def _apart(problem: Problem, fit: Fit, logs: int) -> list[Apart]:
             away = score / known
             out.append(Apart(log, name, away, abs(score) / math.sqrt(known), away * moved))
     return out
+
+
+def _terms(
+    problem: Problem, fit: Fit, stretch: Stretch, c: FloatArray, name: str
+) -> Iterator[tuple[Rows, FloatArray, FloatArray]]:
+    """Rows, pull and weight of what a quantity changes: pictures or the IMU's readings."""
+    if name == SENSOR[_OFFSET]:
+        for off, rows in _pictures(problem, stretch, c, fit.sensor):
+            _, pull, weight, _ = _picture_terms(problem, fit.noise, off)
+            yield rows, pull, weight
+        return
+    for off, rows in _readings(stretch, c, fit.sensor):
+        _, pull, weight = imu_terms(off, fit.noise.imu)
+        yield rows, pull, weight
 
 
 def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
@@ -1362,12 +1378,19 @@ _DIFFERS = {
     "accel_bias_y_mps2": "by {:+.3f} m/s^2",
     "gyro_bias_radps": "by {:+.4f} rad/s",
     "mount_angle_rad": "by {:+.4f} rad",
+    "time_offset_s": "by {:+.4f} s",
 }
+_MOUNTED = "was the IMU or the camera moved between the logs, or the IMU warmer? align this log alone"
+_JOINED = "were camera and IMU joined log by log? where their clocks went on, join all with one --offset"
 
 
 def _differing(found: Alignment) -> Iterator[Finding]:
     """What is most clearly another one in one log; of what is mounted anew biases seem to be others, too."""
-    for names in (("mount_angle_rad", "accel_bias_x_mps2", "accel_bias_y_mps2"), ("gyro_bias_radps",)):
+    for names, advice in (
+        (("mount_angle_rad", "accel_bias_x_mps2", "accel_bias_y_mps2"), _MOUNTED),
+        (("gyro_bias_radps",), _MOUNTED),
+        (("time_offset_s",), _JOINED),
+    ):
         mine = [one for one in found.apart if one.name in names]
         if mine:
             most = max(mine, key=lambda one: one.deviations)
@@ -1375,7 +1398,7 @@ def _differing(found: Alignment) -> Iterator[Finding]:
                 "remark",
                 f"{found.logs[most.log].name}: {QUANTITIES[most.name].words} differs from that in the other "
                 f"logs {_DIFFERS[most.name].format(most.away)}; the deviations hold this",
-                "was the IMU or the camera moved between the logs, or the IMU warmer? align this log alone",
+                advice,
             )
 
 
