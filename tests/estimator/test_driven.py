@@ -481,7 +481,7 @@ def test_steps_are_as_exact_where_the_damping_is_stiff(log_damping: float) -> No
 @pytest.mark.parametrize("seed", range(4))
 def test_the_jacobian_agrees_with_central_differences(pump: Pump, seed: int) -> None:
     body = replace(pumps_connected(), gravity_mps2=(0.4 * (seed % 2), 9.81 * (seed % 2)))
-    plant, x = Drive(body, pump).numbers(), some_state(seed)
+    plant, x = Drive(body, pump=pump).numbers(), some_state(seed)
     segments = np.array([[0.004, 1.5, 0.2], [0.003, 1.2, 0.1]])
     F = stepped(plant, x, segments)[1]
     central = np.empty_like(F)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +12,8 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.stages.actuator.dynamics import Coefficients, coefficients, rates
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w
-from calib.stages.actuator.parameters import DAMPING_SCALE_FREE, Plant, pumps_connected
+from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.pump import (
-    Pump,
     PumpCoefficients,
     advance_pump,
     pump_coefficients,
@@ -491,13 +490,11 @@ SIGMA = (0.08, 0.1, 0.1, 0.06, 0.06, 0.06, 0.08, 5e-4, 0.08, 0.1, 0.1)
 
 
 @dataclass(frozen=True)
-class Drive:
-    """Plant and pumps of the driven filter.
+class Drive(Machine):
+    """Plant and pumps of the driven filter; until the first command nobody knows whether the hoses are on.
 
     Attributes
     ----------
-    plant, pump, strength : nominal, with the hoses on; factors on the pumps' static forces.
-    free_damping_scale : c_dmp with the hoses off. Until the first command nobody knows which it is.
     sigma : (11,) deviations of `PARAMETER`.
     covariance : (11, 11) of the same where they are not independent; its diagonal is `sigma` squared.
     sigma_force_N, sigma_disturbance_N, sigma_creep_N : of the state before the first reading.
@@ -513,10 +510,6 @@ class Drive:
         accelerations; None for those of the set-up.
     """
 
-    plant: Plant = field(default_factory=pumps_connected)
-    pump: Pump = field(default_factory=Pump)
-    strength: tuple[float, float] = (1.0, 1.0)
-    free_damping_scale: float = DAMPING_SCALE_FREE
     sigma: tuple[float, ...] = SIGMA
     sigma_force_N: float = 0.03
     sigma_disturbance_N: float = 0.01
