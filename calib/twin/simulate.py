@@ -17,9 +17,9 @@ from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import PumpCoefficients, delayed, pump_coefficients, settling_force_N
 from calib.stages.actuator.simulate import STATE, RigState, check_start, largest_step_s
 from calib.stages.actuator.simulate import run as run_kernel
-from calib.stages.estimator.baseline import Baseline, BaselineSetup
+from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
 from calib.stages.estimator.kinematic import Rows
-from calib.twin.rig import SimulatedRig, workspace_homography
+from calib.twin.rig import SimulatedRig
 from calib.twin.sensors import (
     Trajectory,
     draw_imu_noise,
@@ -173,11 +173,16 @@ class Sensors:
             self.onchip_rad[samples] = onchip_angle_rad(self.rig.imu, self.imu, samples, motion)
 
 
+WORKSPACE_M = (-0.06, 0.05, 0.06, 0.11)
+"""Where the board of a rig without a lens model was laid for its plane."""
+
+
 class _Eyes:
     """The firmware at work: from the readings up to a tick to what the controller sees."""
 
     def __init__(self, rig: SimulatedRig, sensors: Sensors) -> None:
-        to_plane = np.asarray(np.linalg.inv(workspace_homography(rig.view)), dtype=np.float64)
+        view = rig.view
+        to_plane = undistorting_nothing(view.camera, view.R_CW, view.t_CW_m, WORKSPACE_M)
         plant, offset_m = rig.plant, rig.tracker.marker_offset_m
         self.firmware = Baseline(
             BaselineSetup(to_plane, plant.bellows_radius_m, plant.rest_length_m, offset_m, rig.imu.rate_hz)

@@ -35,7 +35,8 @@ def _scored(name: str, seed: int) -> list[tuple[float, float]]:
     setup, rows = setup_for(rig, seed), rows_from(log)
     known = np.flatnonzero(rows.kinds & 1)
     late, true, r = rows.t_s[known] > 0.5, truth(log)[known], setup.bellows_radius_m
-    place = undistorting_nothing(setup.view, (-0.06, 0.04, 0.06, 0.11), rig.view.camera.image_size_px)
+    view = rig.view
+    place = undistorting_nothing(view.camera, view.R_CW, view.t_CW_m, (-0.06, 0.04, 0.06, 0.11))
     source = Baseline(BaselineSetup(place, r)).run(rows)[known]
     full = Filter(setup).run(rows)[known]
     found = [source[:, (1, 2, 3)], full[:, (1, 2, 5)]]

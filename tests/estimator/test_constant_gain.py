@@ -110,7 +110,8 @@ def test_beats_the_low_pass_on_a_log(name: str) -> None:
     known = np.flatnonzero(rows.kinds & 1)
     late, r, true = rows.t_s[known] > 0.5, setup.bellows_radius_m, truth(log)[known]
     errors = np.stack([out[:, 1] + r * out[:, 0], out[:, 1] - r * out[:, 0]], axis=1)[late] - true[late, :2]
-    place = undistorting_nothing(setup.view, (-0.06, 0.04, 0.06, 0.11), rig.view.camera.image_size_px)
+    view = rig.view
+    place = undistorting_nothing(view.camera, view.R_CW, view.t_CW_m, (-0.06, 0.04, 0.06, 0.11))
     other = Baseline(BaselineSetup(place, r)).run(rows)[known][late]
     low_pass = other[:, 1:3] - true[late, :2]
     assert np.abs(errors).mean() < 0.5 * np.abs(low_pass).mean()

@@ -21,13 +21,13 @@ from calib.stages.actuator.pump import ElongationForce
 from calib.stages.camera.bundle import Calibration, calibrate
 from calib.stages.camera.lens import fit_inverse, pixel_grid
 from calib.stages.camera.model import View, distort, pack, undistort
+from calib.stages.estimator.baseline import undistorting_nothing
 from calib.stages.imu.mahony import Mahony, accelerometer_angles, advance, filter_log
 from calib.stages.lowpass.filters import Design, dc_delay_s, design_lowpass, filter_signal, frequency_response
 from calib.twin.pictures import BOARD, CAMERA, PLANE, shots
-from calib.twin.rig import workspace_homography
 from calib.twin.scenarios import elongation_mm
 from calib.twin.scene import PrintedBoard, corner_pixels
-from calib.twin.simulate import Run
+from calib.twin.simulate import WORKSPACE_M, Run
 from thesis.plot import curve
 from thesis.runs import Values, angles_rad, figure, once, share_of_way_s, tried
 
@@ -279,7 +279,8 @@ def lp_cutoff() -> Values:
 
 def _marker_m(run: Run) -> FloatArray:
     """Marker (n, 2) [m] in the plane as the firmware maps its pixels, held where none was found."""
-    H = np.linalg.inv(workspace_homography(run.rig.view))
+    view = run.rig.view
+    H = undistorting_nothing(view.camera, view.R_CW, view.t_CW_m, WORKSPACE_M)
     rows = np.column_stack([run.sensors.pixels, np.ones(len(run.sensors.pixels))]) @ H.T
     plane = rows[:, :2] / rows[:, 2:]
     at = np.maximum.accumulate(np.where(np.isfinite(plane[:, 0]), np.arange(len(plane)), 0))

@@ -17,9 +17,11 @@ from calib.io.logs import check_time, read_log
 from calib.io.pictures import list_pictures
 from calib.stages.camera.model import Camera, project
 from calib.stages.camera.read import read_board_file
+from calib.stages.estimator.baseline import undistorting_nothing
 from calib.twin.folder import LOGS, write_rig_folder
-from calib.twin.rig import SimulatedRig, nominal_view, rig_from_file, workspace_homography
+from calib.twin.rig import SimulatedRig, nominal_view, rig_from_file
 from calib.twin.sensors import View
+from calib.twin.simulate import WORKSPACE_M
 
 
 @pytest.fixture
@@ -46,17 +48,21 @@ def test_a_calibrated_camera_and_plane_are_taken_over(rig) -> None:
     assert np.array_equal(made.view.R_CW, view.R_CW)
 
 
+def _without_lens(view: View) -> np.ndarray:
+    return np.linalg.inv(undistorting_nothing(view.camera, view.R_CW, view.t_CW_m, WORKSPACE_M))
+
+
 def test_the_homography_without_a_lens_model_is_the_nearest() -> None:
     view = nominal_view()
     x, y = np.meshgrid(np.linspace(-0.04, 0.04, 7), np.linspace(0.08, 0.105, 5))
     world = np.stack([x.ravel(), y.ravel()], axis=1)
     pixels = project(view.camera, world @ view.R_CW[:, :2].T + view.t_CW_m)
-    fitted = np.linalg.norm(apply_homography(workspace_homography(view), world) - pixels, axis=1)
+    fitted = np.linalg.norm(apply_homography(_without_lens(view), world) - pixels, axis=1)
     A = view.camera.K @ np.column_stack([view.R_CW[:, :2], view.t_CW_m])
     naive = np.linalg.norm(apply_homography(A, world) - pixels, axis=1)
     assert fitted.max() < 0.2 < 0.5 < naive.max()
     ideal = View(Camera("pinhole", (316, 208), 273.4, 272.6, 0.0, 160.7, 101.9), view.R_CW, view.t_CW_m)
-    H = workspace_homography(ideal)
+    H = _without_lens(ideal)
     assert np.allclose(H / H[2, 2], A / A[2, 2], rtol=1e-8, atol=1e-9)
 
 

@@ -19,9 +19,9 @@ from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.simulate import state_row
 from calib.stages.control.references import Ellipse
-from calib.stages.estimator.baseline import Baseline, BaselineSetup
+from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
 from calib.stages.estimator.kinematic import Rows
-from calib.twin.rig import nominal_view, workspace_homography
+from calib.twin.rig import nominal_view
 from calib.twin.sensors import (
     MOTION,
     HeadMotion,
@@ -40,6 +40,7 @@ from calib.twin.sensors import (
     stream,
     track,
 )
+from calib.twin.simulate import WORKSPACE_M
 
 
 def test_the_motion_of_a_swing_is_that_of_its_path() -> None:
@@ -309,12 +310,13 @@ def test_accelerations_are_those_of_the_jacobian_and_its_rate(bend: float) -> No
 
 
 RADIUS_M_FEEDBACK, D_M = 0.0126, 0.015
-H = workspace_homography(nominal_view())
+TO_PLANE = undistorting_nothing(VIEW.camera, VIEW.R_CW, VIEW.t_CW_m, WORKSPACE_M)
+H = np.linalg.inv(TO_PLANE)
 
 
 def _frames(pixels: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """phi, q1, q2 at each tick for an angle filter that takes the accelerometer's angle at once."""
-    setup = BaselineSetup(np.linalg.inv(H), RADIUS_M_FEEDBACK, 0.065, D_M, 100.0, Kp=100.0, Ki=0.0)
+    setup = BaselineSetup(TO_PLANE, RADIUS_M_FEEDBACK, 0.065, D_M, 100.0, Kp=100.0, Ki=0.0)
     felt = 9.81 * np.stack([np.cos(phi), np.sin(phi), 0.0 * phi], axis=1)
     rows = Rows(np.zeros(len(phi)), np.column_stack([pixels, felt]), np.full(len(phi), 3))
     return Baseline(setup).run(rows)[:, [3, 1, 2]]

@@ -13,13 +13,14 @@ A plane seen with little perspective fits nearly as well when tilted the other w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import apply_homography, fit_homography, grouped_variance
+from calib.core.geometry import apply_homography, box_grid, fit_homography, grouped_variance, in_picture
 from calib.stages.camera.bundle import linearise, minimise
 from calib.stages.camera.model import (
     INTRINSICS,
@@ -181,3 +182,21 @@ def plane_pixels(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, world_m: 
     points_C = world_m @ R_CW[:, :2].T + t_CW_m
     front = points_C[..., 2:] > 0.0
     return np.where(front, project(camera, np.where(front, points_C, 1.0)), np.nan)
+
+
+_FEWEST_SEEN = 12
+"""Of the 63 places of the grid."""
+
+
+def homography_with_lens(
+    camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, workspace_m: Sequence[float]
+) -> FloatArray | None:
+    """H (3, 3), metres to pixels, fitted to where camera and lens show a grid over the workspace.
+
+    It spreads what neglecting the lens costs over the workspace (x0, y0, x1, y1), as a calibration without a
+    lens does (2.9). None where the camera sees too little of it.
+    """
+    world = box_grid(workspace_m, 9, 7).reshape(-1, 2)
+    pixels = plane_pixels(camera, R_CW, t_CW_m, world)
+    seen = in_picture(pixels, camera.image_size_px)
+    return fit_homography(world[seen], pixels[seen]).H if seen.sum() >= _FEWEST_SEEN else None

@@ -14,6 +14,7 @@ made of all rows up to it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +22,11 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.core.geometry import box_grid, fit_homography, in_picture
 from calib.io.states import BASELINE
 from calib.stages.actuator.kinematics import inverse_coefficients
+from calib.stages.camera.model import Camera
+from calib.stages.camera.pose import homography_with_lens
 from calib.stages.estimator.kinematic import Rows
-from calib.stages.estimator.sensors import SIZE, marker
 
 _SERIES = np.array([float(c) for c in inverse_coefficients()])
 _MEMORY = 12
@@ -55,29 +56,15 @@ class BaselineSetup:
 
 
 def undistorting_nothing(
-    view: FloatArray, workspace_m: tuple[float, float, float, float], image_size_px: tuple[int, int]
+    camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, workspace_m: Sequence[float]
 ) -> FloatArray:
-    """A^-1 (3, 3) of a homography fitted to where camera and lens show the workspace.
-
-    It spreads the neglected distortion over the workspace as a calibration without a lens does.
-
-    Parameters
-    ----------
-    view : (25,) of `sensors.view_coefficients`.
+    """A^-1 (3, 3) of `homography_with_lens`, as a calibration without a lens finds it.
 
     Raises `BadInputError` where the camera does not see enough of the workspace.
     """
-    world = box_grid(workspace_m, 9, 7).reshape(-1, 2)
-    pixels = np.empty_like(world)
-    state, by = np.zeros(SIZE), np.empty((2, SIZE))
-    for i, place in enumerate(world):
-        # A head of no length at the origin, seen at a shifted place.
-        state[14:16] = place
-        pixels[i] = marker(view, state, by[0], by[1])
-    inside = in_picture(pixels, image_size_px)
-    if inside.sum() < 12:
+    H = homography_with_lens(camera, R_CW, t_CW_m, workspace_m)
+    if H is None:
         raise BadInputError("plane: the camera does not see the workspace")
-    H = fit_homography(world[inside], pixels[inside]).H
     return np.asarray(np.linalg.inv(H), dtype=np.float64)
 
 

@@ -496,12 +496,12 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
 
 def baseline_setup(setup: Setup, rig: Rig, path: Path, found: Periods) -> BaselineSetup:
     """The source's pipeline for the same rig, without what it does not know of."""
-    if rig.camera is None or not found.camera:
+    plane = rig.current_plane(str(path))
+    if rig.camera is None or plane is None or not found.camera:
         raise BadInputError(f"{shown(path)}: the baseline needs a camera, a plane, and pictures in the log")
-    x0, y0, x1, y1 = rig.workspace_m
-    width, height = rig.camera.image_size_px
+    R, t = np.array(plane.R_CW), np.array(plane.t_CW_m)
     return BaselineSetup(
-        undistorting_nothing(setup.view, (x0, y0, x1, y1), (width, height)),
+        undistorting_nothing(rig.camera.optics, R, t, rig.workspace_m),
         setup.bellows_radius_m,
         float(setup.start.head[1]),
         float(setup.start.sensor[6]),
@@ -591,7 +591,7 @@ def _driving_covariance(
 
 def drive_from_rig(rig: Rig) -> Drive:
     """Plant and pumps with their deviations; what the rig lacks is nominal."""
-    machine, nominal, sections = rig.machine, Drive(), rig.standing
+    nominal, sections = Drive(), rig.standing
     table = None if rig.actuator is None else rig.actuator.covariance
     sigma = dict(zip(PARAMETER, nominal.sigma, strict=True))
     for name, (section, key) in _SIGMA.items():
@@ -615,12 +615,4 @@ def drive_from_rig(rig: Rig) -> Drive:
             walk_rates=(tuned.walk_turning_radps_per_sqrt_s, tuned.walk_growing_mps_per_sqrt_s),
             walk_forces=tuned.walk_forces_N_per_sqrt_s,
         )
-    return replace(
-        nominal,
-        plant=machine.plant,
-        pump=machine.pump,
-        strength=machine.strength,
-        free_damping_scale=machine.free_damping_scale,
-        sigma=tuple(sigma.values()),
-        covariance=covariance,
-    )
+    return replace(nominal, **vars(rig.machine), sigma=tuple(sigma.values()), covariance=covariance)

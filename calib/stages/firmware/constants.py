@@ -14,11 +14,11 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import box_grid, fit_homography, in_picture
+from calib.core.geometry import apply_homography, box_grid, in_picture
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficients
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
-from calib.stages.camera.model import project
+from calib.stages.camera.pose import homography_with_lens, plane_pixels
 from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
 from calib.stages.estimator import constant_gain
@@ -142,17 +142,16 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
     depth = _depths(A * scale, grid)
     if not depth.min() > 0.0:
         raise BadInputError("plane: the workspace reaches behind the camera, so no marker can be mapped")
-    pixels = project(camera, grid @ R[:, :2].T + t)
-    inside = in_picture(pixels, camera.image_size_px)
     raw, raw_least, error = None, 0.0, 0.0
-    if inside.sum() >= 12:
-        H = fit_homography(grid[inside], pixels[inside]).H
+    H = homography_with_lens(camera, R, t, rig.workspace_m)
+    if H is not None:
         centre = np.array([rig.middle_m])
         H = H * (float((centre @ R[2, :2] + t[2])[0]) / _depths(H, centre)[0])
         raw = np.asarray(np.linalg.inv(H))
         raw_least = _HORIZON_SHARE / float(_depths(H, grid).max())
-        back = np.concatenate([pixels[inside], np.ones((int(inside.sum()), 1))], axis=1) @ raw.T
-        error = float(np.abs(back[:, :2] / back[:, 2:] - grid[inside]).max())
+        pixels = plane_pixels(camera, R, t, grid)
+        back = apply_homography(raw, pixels) - grid
+        error = float(np.abs(back[in_picture(pixels, camera.image_size_px)]).max())
     right = np.eye(3)
     if rig.align is not None:
         shrink, (across, along) = 1.0 / (1.0 + rig.align.plane_stretch), rig.align.plane_shift_m
