@@ -112,34 +112,45 @@ class GyroSigma(IntrinsicsSigma):
     sensitivity: Matrix3 | None = None
 
 
-class AccelIntrinsics(Section):
-    """a = T diag(1 / scale) (reading - bias), T = [[1, -yz, zy], [0, 1, -zx], [0, 0, 1]].
+class SensorIntrinsics(Section):
+    """What accelerometer and gyroscope have in common; the equations are theirs.
 
     Attributes
     ----------
     unit : of the readings. Lists hold x, y, z, null for what was not calibrated or cannot be told.
-    bias, scale : in that unit, and in that unit per m/s^2.
-    misalignment_rad : yz, zy, zx; in a plane yz alone.
+    bias, scale : in that unit, and in that unit per m/s^2 or rad/s.
+    misalignment_rad : angles of T by the names in it.
     matrix : T diag(1 / scale); absent where a part of it is not known.
-    rms_mps2 : of | |a| - g | over the rests; `disagreement_mps2` is what noise does not explain of it.
     """
 
-    unit: Literal["m/s2", "counts"] = quantity(label="readings in")
+    unit: str = quantity(label="readings in")
     bias: PerAxis = quantity(label="bias")
     scale: PerAxis = quantity(label="scale")
     misalignment_rad: Angles = quantity({}, label="misalignment", show="mrad", digits=3)
     sigma: IntrinsicsSigma
     matrix: Matrix3 | None = None
+
+
+class AccelIntrinsics(SensorIntrinsics):
+    """a = T diag(1 / scale) (reading - bias), T = [[1, -yz, zy], [0, 1, -zx], [0, 0, 1]].
+
+    Attributes
+    ----------
+    misalignment_rad : yz, zy, zx; in a plane yz alone.
+    rms_mps2 : of | |a| - g | over the rests; `disagreement_mps2` is what noise does not explain of it.
+    """
+
+    unit: Literal["m/s2", "counts"] = quantity(label="readings in")
     rms_mps2: NotNegative | None = quantity(None, label="rests differ from g by (RMS)", digits=6)
     disagreement_mps2: NotNegative | None = quantity(None, label="rests disagree beyond noise by", digits=6)
 
 
-class GyroIntrinsics(Section):
+class GyroIntrinsics(SensorIntrinsics):
     """w = T diag(1 / scale) (reading - bias - S a), T = [[1, -yz, zy], [xz, 1, -zx], [-xy, yx, 1]].
 
     Attributes
     ----------
-    unit, scale, misalignment_rad, matrix : as of the accelerometer, per rad/s, to the same frame.
+    scale, misalignment_rad : per rad/s, to the accelerometer's frame.
     bias : at no specific force where `sensitivity` is there, else that of the rest at the start.
     start_bias : mean of the rest at the start.
     sensitivity : S, in the readings' unit per m/s^2, rows gx, gy, gz.
@@ -147,11 +158,7 @@ class GyroIntrinsics(Section):
     """
 
     unit: Literal["rad/s", "counts"] = quantity(label="readings in")
-    bias: PerAxis = quantity(label="bias")
-    scale: PerAxis = quantity(label="scale")
-    misalignment_rad: Angles = quantity({}, label="misalignment", show="mrad", digits=3)
     sigma: GyroSigma
-    matrix: Matrix3 | None = None
     start_bias: PerAxis = quantity(label="bias at the start")
     sensitivity: Matrix3 | None = None
     rms_rad: NotNegative = quantity(label="turns miss gravity by (RMS)", show="deg", digits=4)
