@@ -309,7 +309,7 @@ def check_url(url: str, allowed: Allowed) -> None:
 def local_folder(
     source: str,
     scratch: Path,
-    attempts: int,
+    attempts: int = 3,
     most_bytes: int = MOST_BYTES,
     allowed: Allowed = Allowed(),
 ) -> Path:
@@ -467,12 +467,10 @@ class FleetOptions:
     Attributes
     ----------
     pages : whether each rig's page is made and brought back.
-    attempts : to fetch a file. most_bytes : of a folder that is fetched. allowed : what may be fetched.
+    allowed : what may be fetched.
     """
 
     pages: bool = False
-    attempts: int = 3
-    most_bytes: int = MOST_BYTES
     allowed: Allowed = Allowed()
 
 
@@ -500,7 +498,7 @@ def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answ
 
 
 def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -> Answer:
-    root = local_folder(spec.source, place / "fetched", options.attempts, options.most_bytes, options.allowed)
+    root = local_folder(spec.source, place / "fetched", allowed=options.allowed)
     folder = read_folder(root)
     kind = kind_of(folder)
     inputs = {folder.name_of(path): digest for path, digest in folder_digests(folder).items()}
@@ -925,7 +923,7 @@ class FleetSummary:
     verdicts : rigs by verdict. stages : of each stage the rigs by verdict.
     constants : in the order of the file. looks : the rigs to look at, the worst first, no more than 200.
     to_look_at : how many there are.
-    numbered : rigs whose serial has a number. limit : |z| beyond which one stands out, NaN for too few rigs.
+    limit : |z| beyond which one stands out, NaN for too few rigs.
     """
 
     rigs: int
@@ -934,7 +932,6 @@ class FleetSummary:
     constants: tuple[ConstantSummary, ...]
     looks: tuple[Look, ...]
     to_look_at: int
-    numbered: int
     limit: float
 
     @property
@@ -989,7 +986,6 @@ def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
         tuple(constants),
         looks,
         to_look_at,
-        int(np.isfinite(numbers).sum()),
         limit,
     )
     return summary, worst, which

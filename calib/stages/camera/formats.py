@@ -395,8 +395,8 @@ def to_kalibr(camera: Camera, name: str = "cam0") -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
 
 
-def from_kalibr(text: str, entry: str = "cam0") -> Camera:
-    """Camera `entry` of a Kalibr camchain YAML, pinhole with radtan, equidistant or no distortion.
+def from_kalibr(text: str) -> Camera:
+    """Camera cam0 of a Kalibr camchain YAML, pinhole with radtan, equidistant or no distortion.
 
     Raises
     ------
@@ -404,32 +404,30 @@ def from_kalibr(text: str, entry: str = "cam0") -> Camera:
         Naming the key that is missing or wrong, or the model that cannot be expressed.
     """
     document = _mapping(text)
-    if not isinstance(document.get(entry), dict):
+    if not isinstance(document.get("cam0"), dict):
         known = ", ".join(str(key)[:40] for key in list(document)[:5]) or "nothing"
-        raise BadInputError(f"{entry} is missing from the camchain, which has {known}")
-    camera = document[entry]
+        raise BadInputError(f"cam0 is missing from the camchain, which has {known}")
+    camera = document["cam0"]
     if camera.get("camera_model") != "pinhole":
         raise BadInputError(
-            f"{entry}.camera_model is {quoted(camera.get('camera_model'))}, expected pinhole; no other can "
+            f"cam0.camera_model is {quoted(camera.get('camera_model'))}, expected pinhole; no other can "
             "be expressed"
         )
     model = camera.get("distortion_model")
     if model not in ("radtan", "equidistant", "none"):
         raise BadInputError(
-            f"{entry}.distortion_model is {quoted(model)}, expected radtan, equidistant or none; no other "
+            f"cam0.distortion_model is {quoted(model)}, expected radtan, equidistant or none; no other "
             "can be expressed"
         )
-    fx, fy, cx, cy = _numbers(camera.get("intrinsics"), f"{entry}.intrinsics", 4)
+    fx, fy, cx, cy = _numbers(camera.get("intrinsics"), "cam0.intrinsics", 4)
     coefficients: list[float] = []
     if model != "none":
-        coefficients = _numbers(camera.get("distortion_coeffs"), f"{entry}.distortion_coeffs", 4)
+        coefficients = _numbers(camera.get("distortion_coeffs"), "cam0.distortion_coeffs", 4)
     size = camera.get("resolution")
     if not (isinstance(size, list) and len(size) == 2 and all(_count(value) for value in size)):
-        raise BadInputError(
-            f"{entry}.resolution is {quoted(size)}, expected two whole numbers [width, height]"
-        )
+        raise BadInputError(f"cam0.resolution is {quoted(size)}, expected two whole numbers [width, height]")
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    key = f"{entry}.intrinsics"
+    key = "cam0.intrinsics"
     return _camera((size[0], size[1]), K, np.array(coefficients), key, fisheye=model == "equidistant")
 
 

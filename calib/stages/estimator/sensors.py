@@ -177,10 +177,10 @@ SIZE = len(HEAD) + len(SENSOR)
 GRAVITY_MPS2 = 9.81
 
 
-def _slope_series(terms: int = 13) -> tuple[float, ...]:
+def _slope_series() -> tuple[float, ...]:
     """Coefficients of -2 dD/dw, highest power of w first."""
     out = []
-    for n in range(2, terms + 2):
+    for n in range(2, 15):
         decay = (Fraction(1, math.factorial(2 * n + 1)) - Fraction(1, math.factorial(2 * n))) * Fraction(
             (-1) ** n, 4**n
         )
