@@ -15,7 +15,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray, rms, robust_sigma
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
-from calib.solve.groups import tied_groups
+from calib.solve.information import scaled_inverse, tied_groups
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
@@ -717,12 +717,6 @@ def solve(problem: Problem, x: FloatArray, most: int = 30, enough: float = -math
     end = np.array(end, dtype=np.float64)
     residual, J, _, _ = all_of(end)
     return end, float(_robust(problem, residual)), residual, J
-
-
-def scaled_inverse(H: FloatArray, rcond: float = 1e-13) -> FloatArray:
-    """Pseudo-inverse of an information matrix (n, n) whose unknowns have units of their own."""
-    size = np.sqrt(np.maximum(np.diag(H), 1e-300))
-    return np.asarray(np.linalg.pinv(H / np.outer(size, size), rcond=rcond) / np.outer(size, size))
 
 
 def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatArray) -> FloatArray:

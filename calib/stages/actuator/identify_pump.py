@@ -17,7 +17,8 @@ from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged, section_json
 from calib.core.rig import Rig
 from calib.core.verdict import Finding, Verdict
-from calib.stages.actuator.identify import Progress, scaled_inverse
+from calib.solve.information import scaled_inverse
+from calib.stages.actuator.identify import Progress
 from calib.stages.actuator.parameters import SUPPLY_V, TICK_S
 from calib.stages.actuator.pump import PWM_MAX
 from calib.stages.actuator.section import (

@@ -14,6 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.result import CovarianceTable, finite_or_none, judged, section_json
 from calib.core.rig import Rig
 from calib.core.verdict import Verdict
+from calib.solve.information import scaled_inverse
 from calib.stages.actuator.identify import (
     PARAMETERS,
     Colour,
@@ -34,7 +35,6 @@ from calib.stages.actuator.identify import (
     judge,
     prospects,
     rms_by_track,
-    scaled_inverse,
     uncertainty,
     values_of,
 )

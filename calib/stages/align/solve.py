@@ -20,7 +20,7 @@ from calib.core.verdict import Finding, Verdict
 from calib.core.words import all_of
 from calib.solve.clock import COARSE, TimeAxis, clock_step_s, time_axis
 from calib.solve.delay import moments, shares, vertex
-from calib.solve.groups import tied_groups
+from calib.solve.information import tied_groups
 from calib.stages.align.section import LogCheck
 from calib.stages.align.spline import (
     BAND,

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.geometry import box_grid
+from calib.solve.information import scaled_inverse
 from calib.stages.camera.bundle import (
     Calibration,
     Minimum,
@@ -446,19 +447,6 @@ def skew_left_out(calibration: Calibration) -> Skew:
         apart_px(freed, step),
         (other - fall) / max(left * inflation**2, 1e-300),
     )
-
-
-def scaled_inverse(S: FloatArray, floor: float = 1e-13) -> FloatArray:
-    """Pseudo-inverse of symmetric matrices (..., G, G) after scaling their diagonals to one.
-
-    Directions that hold less than `floor` of the scaled information are left out.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S, axis1=-2, axis2=-1), 1e-300))
-    values, vectors = np.linalg.eigh(S * scale[..., :, None] * scale[..., None, :])
-    kept = values > floor * np.maximum(values[..., -1:], 1e-300)
-    inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    middle = (vectors * inverse[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return np.asarray(middle * scale[..., :, None] * scale[..., None, :])
 
 
 def gain(S: FloatArray, b: FloatArray) -> FloatArray:

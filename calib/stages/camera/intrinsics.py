@@ -15,6 +15,7 @@ from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
 from calib.core.workers import Workers
 from calib.solve.chance import tail_of_t
+from calib.solve.information import scaled_inverse
 from calib.stages.camera.bundle import (
     Calibration,
     Covariance,
@@ -36,7 +37,6 @@ from calib.stages.camera.checks import (
     lens_shape,
     overdispersion,
     repeated_views,
-    scaled_inverse,
     seen_angles,
     skew_left_out,
     straightened,

@@ -36,6 +36,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.words import several
 from calib.solve.chance import tail_of_f
+from calib.solve.information import scaled_inverse
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
 from calib.stages.camera.checks import (
     Evidence,
@@ -44,7 +45,6 @@ from calib.stages.camera.checks import (
     gain,
     overdispersion,
     points_C,
-    scaled_inverse,
 )
 from calib.stages.camera.model import Block, LeftOut, Observations, project, scale_of
 from calib.stages.camera.verdict import Limits, far_points, quiet_rms
