@@ -923,7 +923,7 @@ class FleetSummary:
     verdicts : rigs by verdict. stages : of each stage the rigs by verdict.
     constants : in the order of the file. looks : the rigs to look at, the worst first, no more than 200.
     to_look_at : how many there are.
-    limit : |z| beyond which one stands out, NaN for too few rigs.
+    numbered : rigs whose serial has a number. limit : |z| beyond which one stands out, NaN for too few rigs.
     """
 
     rigs: int
@@ -932,6 +932,7 @@ class FleetSummary:
     constants: tuple[ConstantSummary, ...]
     looks: tuple[Look, ...]
     to_look_at: int
+    numbered: int
     limit: float
 
     @property
@@ -986,6 +987,7 @@ def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
         tuple(constants),
         looks,
         to_look_at,
+        int(np.isfinite(numbers).sum()),
         limit,
     )
     return summary, worst, which

@@ -148,6 +148,7 @@ def test_outliers_drift_and_looks() -> None:
     assert sum(cx.counts) + cx.below + cx.above == 119 and cx.above == 1
     assert [look.name for look in found.looks] == ["rig3", "rig7", "rig5"] and found.to_look_at == 3
     assert found.looks[0].why == "why 3" and "camera cx is" in found.looks[1].why
+    assert found.numbered == 120
 
 
 def test_few_results_are_not_compared() -> None:
