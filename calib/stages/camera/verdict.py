@@ -660,8 +660,9 @@ def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[
         advice = "Measure the printed squares along both sides; print without scaling."
         yield Finding("inconsistent" if off > Limits.aspect_bad else "remark", text, advice)
     elif pixel > Limits.pixel_aspect:
-        # The board is cleared only where its aspect is known well and is one.
-        cleared = found.aspect_sigma < 0.2 * pixel and off < 2.5 * found.aspect_sigma
+        # The board is cleared only where its aspect is known well and is one, as far as that matters.
+        one = max(2.5 * found.aspect_sigma, Limits.aspect_remark)
+        cleared = found.aspect_sigma < 0.2 * pixel and off < one
         text = f"fx and fy differ by {100 * pixel:.1f} %" + (
             "; boards turned in their plane agree that the pixels, not the squares, are not square."
             if cleared
