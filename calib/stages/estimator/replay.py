@@ -842,7 +842,8 @@ def _unstated(rig: Rig) -> list[Finding]:
         f"nobody has stated the bellows' radius: with {1e3 * rig.plant.bellows_radius_m:g} mm for it, each "
         "millimetre that it is off moves q1 and q2 by half a millimetre at 30 degrees"
     )
-    return [Finding("remark", text, "measure it, and state it as known: {actuator: {bellows_radius_m: ...}}")]
+    advice = "measure the bellows' radius, and state it as known: {actuator: {bellows_radius_m: ...}}"
+    return [Finding("remark", text, advice)]
 
 
 def _taken(log: OpenLog, driven: bool) -> list[str]:
