@@ -31,7 +31,8 @@ SENTENCE = "compiling what this needs, once for this installation: up to a minut
 def telling(verb: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
     """A verb that says so once, on a terminal, when it has something compiled at its first use."""
 
-    @functools.wraps(verb)
+    # What typer and the manual read; Python 3.14 would hand on a function's own annotations alone.
+    @functools.wraps(verb, assigned=(*functools.WRAPPER_ASSIGNMENTS, "__annotations__"))
     def told(*args: Parameters.args, **options: Parameters.kwargs) -> Returned:
         if not sys.stderr.isatty():
             return verb(*args, **options)

@@ -142,6 +142,9 @@ def check_writable(path: Path, kind: Kind | None = None) -> None:
         return
     target = _target(path)
     parent = target.parent
+    # A name that is too long is no file to Python 3.14, as one that is not there.
+    with to_be("written", path), contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        target.stat()
     if target.is_dir():
         raise BadInputError(f"{shown(path)}: is a folder, expected a file to write")
     if not parent.is_dir():

@@ -50,7 +50,7 @@ _EXTRAS = {
     "live": "calib live",
     "peers": "filters of others in calib imu drift",
 }
-_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[\w+\])?([^;]*)(?:; *extra *== *['\"](\w+)['\"])?")
+_REQUIREMENT = re.compile(r"([\w.-]+)(?:\[\w+\])?([^;]*)(?:;.*extra *== *['\"](\w+)['\"])?")
 
 _TOOLS = (
     (("avr-gcc",), "compiling the firmware for the ATmega328P"),
