@@ -46,11 +46,14 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 IMAGES = ROOT / "images"
 
-RELATIVE = 1e-9 if platform.machine() in ("x86_64", "AMD64") else 1e-4
-"""Numbers are equal when they differ by less than this, relative to the greater one.
+SAME_DIGITS = platform.machine() in ("x86_64", "AMD64") and math.erf(0.25).hex() == "0x1.1af54e232d608p-2"
+"""Whether this is a processor and a C library as those that stored the numbers.
 
-Other processors than those that stored them have other kernels: a search ends elsewhere within its tolerance.
+Other processors have other kernels, and glibc 2.43 rounds erf otherwise: a search ends elsewhere within its
+tolerance.
 """
+RELATIVE = 1e-9 if SAME_DIGITS else 1e-4
+"""Numbers are equal when they differ by less than this, relative to the greater one."""
 FLOOR = 1e-15
 """Numbers that are both smaller than this are equal: what is left of a sum that cancels."""
 EVERY = 50
@@ -71,6 +74,16 @@ class Loose:
 
 
 LOOSE: tuple[Loose, ...] = ()
+if not SAME_DIGITS:
+    LOOSE = (
+        Loose(
+            "poor/report.html.txt",
+            r"^\| moved.csv ",
+            0.01,
+            0.01,
+            "without a plane and an alignment the log hardly tells where it began",
+        ),
+    )
 
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _HASH = re.compile(r"\b[0-9a-f]{40,}\b")
@@ -611,7 +624,7 @@ def _apart(a: str, b: str, relative: float, floor: float) -> float:
         return 0.0
     if abs(x - y) > relative * size:
         return abs(x - y) / size
-    formatted = all(sum(map(str.isdigit, text.split("e")[0])) <= SHORT for text in (a, b))
+    formatted = SAME_DIGITS and all(sum(map(str.isdigit, text.split("e")[0])) <= SHORT for text in (a, b))
     return sys.float_info.epsilon if formatted and a != b else 0.0
 
 
