@@ -154,6 +154,23 @@ def test_a_clock_that_steps_midway_is_named() -> None:
     assert finding.text.startswith("from ")
 
 
+@pytest.mark.parametrize("k", [0, 2, 5, 30, 54])
+@pytest.mark.parametrize("gap_s", [0.0, 10.0])
+def test_a_jump_before_a_gap_or_at_an_end_is_looked_at(k: int, gap_s: float) -> None:
+    """Where too few pictures tell whether it stays, it does; two of these cases raised IndexError."""
+    count = 61
+    t_s = np.arange(count) / 60.0 + 10.0
+    t_s[k + 1 :] += gap_s
+    out = np.full((count, len(OUT)), np.nan)
+    out[:, OUT.index("t_s")], out[:, OUT.index("flags")], out[:, OUT.index("gated_camera")] = t_s, 0.0, 0.0
+    for name in ("e_u", "e_v", "nis_camera"):
+        out[:, OUT.index(name)] = 0.1
+    out[k:, OUT.index("e_v")] = 20.0 * 0.7 ** np.arange(count - k)
+    tally = Tally(0.0126, rows=1, start_s=0.0)
+    tally.add(out, None, np.column_stack([np.full(count, 150.0), 100.0 + 8.0 * (np.arange(count) >= k)]))
+    assert len(list(jumped(tally))) == 1
+
+
 def test_delays_are_not_looked_for_in_a_log_at_rest() -> None:
     _, log = driven_log("static")
     late = _delayed(log, ("gz_radps",), 5)

@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from calib.core.arrays import FloatArray, robust_sigma
 from calib.core.result import finite_or_none
@@ -61,21 +60,26 @@ def nees(out: FloatArray, q_m: FloatArray, phi_rad: FloatArray, bellows_radius_m
 
 
 def _back_again(t_s: FloatArray, e: FloatArray, readings: FloatArray, k: int) -> int | None:
-    """Index from which on a jump of the readings at `k` is undone; None where it stays.
+    """Index from which on a jump of the readings at `k` is undone; None where it stays, or too few tell.
 
     They change back then, by half as much or more, and so do the innovations, which alone do when a filter
     follows a jump.
     """
+    from scipy.ndimage import median_filter
+
     first, end = max(k - _TOGETHER, 0), int(np.searchsorted(t_s, t_s[k] + _BACK_S))
-    back = np.ones(max(end - first - 5, 0), dtype=np.bool_)
+    if k - first < 3 or end - k < 3:
+        # From three before to three from there on, of pictures that a gap may follow.
+        return None
+    back = np.ones(end - first - 5, dtype=np.bool_)
     for values in (readings[first:end], e[first:end]):
         # From the mean of three to that of the next three; beside what moves all the time.
         means = np.convolve(values, np.ones(3) / 3, "valid")
         changes = means[3:] - means[:-3]
         changes = changes - median_filter(changes, _AROUND)
-        at = min(k - first - 3, len(changes) - 1)
-        back &= changes * changes[at] < -0.5 * changes[at] ** 2
-    later = np.flatnonzero(back[max(k - first - 2, 0) :])
+        at = changes[k - first - 3]
+        back &= changes * at < -0.5 * at**2
+    later = np.flatnonzero(back[k - first - 2 :])
     if not len(later):
         return None
     j = k + 1 + int(later[-1])
