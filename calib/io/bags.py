@@ -252,6 +252,9 @@ def reader_of(source: str, topic: str, field: Field) -> Callable[[Any], float]:
     def found(message: Any) -> Any:
         value = message
         for step in steps:
+            if isinstance(step, int) and isinstance(value, Sequence) and not value:
+                # Nothing was detected.
+                return None
             try:
                 value = (
                     value[step] if isinstance(step, int) or isinstance(value, dict) else getattr(value, step)
@@ -655,6 +658,10 @@ def _kind(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
+_ZSTD_FRAME = b"\x28\xb5\x2f\xfd"
+"""The beginning of what is packed; a message begins with a zero."""
+
+
 class _RosBag:
     """A bag that `rosbags` has opened."""
 
@@ -668,7 +675,9 @@ class _RosBag:
         wanted = set(names)
         connections = [item for item in self._reader.connections if item.topic in wanted]
         for connection, received, data in self._reader.messages(connections=connections):
-            data = unpacked(self._packing, data) if self._packing else data
+            # The file of a bag without its folder does not say that its messages are packed.
+            if self._packing or (self._reader.is2 and data[:4] == _ZSTD_FRAME):
+                data = unpacked("zstd", data)
             yield connection.topic, received, self._reader.deserialize(data, connection.msgtype)
 
 

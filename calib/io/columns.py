@@ -242,6 +242,7 @@ class Passed:
     wraps : how often the counter that is the time began again.
     sorted : rows that stood below a later one, and were put where they belong.
     twice : rows that say what the one before says, at its time, and were left out.
+    said : lines of words alone between the rows, as a board prints them.
     """
 
     not_finite: int = 0
@@ -254,6 +255,7 @@ class Passed:
     end: str = ""
     sorted: int = 0
     twice: int = 0
+    said: int = 0
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -267,6 +269,7 @@ class Passed:
             self.end or later.end,
             self.sorted + later.sorted,
             self.twice + later.twice,
+            self.said + later.said,
         )
 
     @property
@@ -282,9 +285,10 @@ class Passed:
                 f"{self.clipped} readings are at the end of a sensor's range ({self.end}) {blank}",
             ),
             (self.truncated, "the last line is cut short and left out"),
-            (self.wraps, f"the time is a counter that begins again {self.wraps} times, and is counted on"),
+            (self.wraps, f"the time begins again {self.wraps} times, as counters and days do; counted on"),
             (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
             (self.twice, f"{self.twice} rows are written twice; left out"),
+            (self.said, f"{self.said} lines between the rows hold words and no number; passed over"),
         )
         return [sentence for there, sentence in kinds if there]
 
@@ -653,6 +657,11 @@ def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
                 f"{guess}, add to {columns.folder} the line {_line('t_s', source, guess)}"
             )
         return columns
+    if not len(steps) and rows.sum() >= _FEWEST:
+        raise BadInputError(
+            f"{columns.source}: the time `{one_line(source.column)[:40]}` is {cells['t_s'][rows][0]:.10g} in "
+            "every row, expected it to advance; a program that saved it with few digits has to save all"
+        )
     if len(likely) != 1:
         raise BadInputError(
             f"{columns.source}: cannot tell the unit of the time `{one_line(source.column)[:40]}` from "

@@ -60,7 +60,7 @@ from calib.solve.clock import SPLIT_S, TimeAxis, time_axis
 
 _MOST_CELLS = 200_000_000
 """Numbers that `read_log` takes, 1.6 GB; blocks of text have no such limit."""
-_COUNTERS = (1 << 16, 1 << 32)
+_COUNTERS, _DAY_S = (1 << 16, 1 << 32), 86400
 _WRAPS_WITHIN = 20.0
 """Usual steps from the last time before a counter begins again to the first one after."""
 
@@ -168,7 +168,7 @@ class Log:
 
 def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
     """Blocks in SI; the readings of the first tell the units that nobody states."""
-    blocks = _counted_on(blocks)
+    blocks = _counted_on(blocks, columns.evidence.get("time") == "dates")
     first = next((block for block in blocks if len(block.lines)), None)
     if first is None:
         return
@@ -289,13 +289,13 @@ def unclipped(log: Log) -> Log:
     return _blanked(log, end, lambda count, first: Passed(clipped=count, end=first))
 
 
-def _counted_on(blocks: Iterator[Block]) -> Iterator[Block]:
-    """Blocks whose times run on where they are those of a counter that begins again."""
+def _counted_on(blocks: Iterator[Block], dates: bool) -> Iterator[Block]:
+    """Blocks whose times run on where they are those of a counter that begins again, or of the next day."""
     before, size, laps = math.nan, 0, 0
     for block in blocks:
         t = block.cells["t_s"]
         steps = np.diff(t, prepend=before)
-        size = size or _counter(t, steps)
+        size = size or _counter(t, steps, (_DAY_S,) if dates else _COUNTERS)
         before = float(t[-1]) if len(t) else before
         if size:
             again = steps < -0.5 * size
@@ -306,15 +306,15 @@ def _counted_on(blocks: Iterator[Block]) -> Iterator[Block]:
         yield block
 
 
-def _counter(t: FloatArray, steps: FloatArray) -> int:
-    """Size of the counter that times (n,) are those of, where it begins again; 0 otherwise."""
+def _counter(t: FloatArray, steps: FloatArray, sizes: Sequence[int]) -> int:
+    """Which of the sizes a counter has that times (n,) are those of, where it begins again; 0 otherwise."""
     back, usual = steps[steps < 0.0], steps[steps > 0.0]
-    if not len(back) or not len(usual) or not np.array_equal(t, np.floor(t)):
+    if not len(back) or not len(usual) or (sizes is _COUNTERS and not np.array_equal(t, np.floor(t))):
         return 0
     most = _WRAPS_WITHIN * float(np.median(usual))
     # A counter that is printed as a signed number goes on from minus half its size.
     low, high = (0, 1) if t.min() >= 0.0 else (-0.5, 0.5)
-    fits = (n for n in _COUNTERS if low * n <= t.min() and t.max() < high * n and (back + n <= most).all())
+    fits = (n for n in sizes if low * n <= t.min() and t.max() < high * n and (back + n <= most).all())
     return next(fits, 0)
 
 

@@ -61,7 +61,7 @@ class _Text:
 def _number(text: _Text, word: str, column: str, line: int) -> float:
     """A cell: NaN for blank, inf for what says nan or inf."""
     word = word.strip()
-    if not word:
+    if word in _BLANK:
         return math.nan
     date = text.dates and column == "t_s"
     value = _date_s(word) if date else plain_number(word.replace(",", ".") if text.decimal == "," else word)
@@ -73,11 +73,19 @@ def _number(text: _Text, word: str, column: str, line: int) -> float:
     return value if math.isfinite(value) else math.inf
 
 
+_BLANK = ("", "NA", "N/A", "null", "NULL", "None")
+"""Cells of a sensor that was not sampled, as R, pandas, JavaScript and Python write them."""
 _DATE = "a date such as 2024-05-01T12:00:00.25"
+_TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
 
 
 def _date_s(word: str) -> float | None:
-    """Seconds since 1970 of a date with a time of day, in UTC where no zone is given; None for other text."""
+    """Seconds since 1970 of a date with a time of day, in UTC where no zone is given, or since midnight of a
+    time of day alone; None for other text.
+    """
+    if of_day := _TIME_OF_DAY.fullmatch(word):
+        hours, minutes, seconds = of_day.groups()
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
     try:
         date = datetime.fromisoformat(word)
     except ValueError:
@@ -101,6 +109,7 @@ def _split(where: str, line: str, separator: str) -> list[str]:
 
 
 _NO_ZONE = re.compile(rb"\A[^\n]*?\d\d:\d\d:\d\d(?:\.\d+)?(?![\d.Z+-])")
+_WORD = re.compile(r"\W*[^\W\d_]")
 _PASSED_OVER = re.compile(rb"(?:^|\n)[ \t\r]*(?:[#\n]|$)")
 """A blank line or a comment."""
 _BEGINS = (b"#", b"\n\n", b"\n\r", b"\n ", b"\n\t")
@@ -157,7 +166,7 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
             convert_options=arrow_csv.ConvertOptions(
                 column_types=kinds,
                 include_columns=list(wanted.values()),
-                null_values=[""],
+                null_values=list(_BLANK),
                 decimal_point=text.decimal,
             ),
         )
@@ -193,20 +202,32 @@ def _floats(column: Any) -> FloatArray:
 
 
 def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
-    """The rows line by line, with a sentence for what cannot be read."""
+    """The rows line by line, with a sentence for what cannot be read; what a board says between is no row."""
     values = np.empty((len(lines), len(text.slots)))
-    count = len(text.columns.names)
+    count, said = len(text.columns.names), np.zeros(len(lines), dtype=np.bool_)
     for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
-        where = f"{text.source}, line {line}"
-        cells = _split(where, raw.decode("utf-8", "replace").rstrip("\r"), text.separator)
+        where, words = f"{text.source}, line {line}", raw.decode("utf-8", "replace").rstrip("\r")
+        said[row] = _is_said(text, words)
+        if said[row]:
+            continue
+        cells = _split(where, words, text.separator)
         if len(cells) != count:
             raise BadInputError(f"{where}: has {len(cells)} cells, expected {count} as in the header")
         for k, (name, slot) in enumerate(text.slots.items()):
             values[row, k] = _number(text, cells[slot], name, line)
+    values, lines = values[~said], lines[~said]
     infinite = np.isinf(values)
     values[infinite] = np.nan
     cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
-    return Block(cells_of, lines, Passed(int(infinite.sum())))
+    return Block(cells_of, lines, Passed(int(infinite.sum()), said=int(said.sum())))
+
+
+def _is_said(text: _Text, line: str) -> bool:
+    """Whether a line begins with a word and has no number in any cell."""
+    if not _WORD.match(line):
+        return False
+    cells = [cell.strip(' "') for cell in line.split(text.separator)]
+    return not any(cell in _BLANK[1:] or _numeric([cell], text.separator) for cell in cells)
 
 
 def _separator(line: str) -> str:
@@ -256,15 +277,17 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
             above = f"the table from line {line} on, below `{said}`"
         else:
             ahead = b"".join(lines)
-    where = f"{source}, line {line}"
+    where, head = f"{source}, line {line}", _decoded(raw)
     if not raw.strip():
         raise BadInputError(f"{source}: is empty, expected a header and rows")
     if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
         raise BadInputError(f"{where}: has more than {_LONGEST_LINE} characters, expected a header")
-    try:
-        head = raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInputError(f"{where}: is not UTF-8 text (byte {error.start}), expected a header") from error
+    if not _is_header(raw, file):
+        try:
+            raw.decode("utf-8")
+        except UnicodeDecodeError as error:
+            at = error.start
+            raise BadInputError(f"{where}: is not UTF-8 text (byte {at}), expected a header") from error
     if "\0" in head:
         raise BadInputError(f"{where}: has a zero byte, expected a text file")
     separator = (file and file.separator) or _mark(head)
@@ -306,9 +329,17 @@ def _lines_up_to_a_header(stream: BinaryIO, file: ColumnsFile | None) -> Iterato
             return
 
 
+def _decoded(raw: bytes) -> str:
+    """A line of UTF-8, or of the code page of Windows, which spreadsheets write."""
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", "replace")
+
+
 def _is_header(raw: bytes, file: ColumnsFile | None) -> bool:
     """Whether a line names the time and another column, or three columns."""
-    text = raw.decode("utf-8-sig", "replace").strip()
+    text = _decoded(raw).strip()
     names = [name.strip().strip('"') for name in text.split((file and file.separator) or _mark(text))]
     stated = {one.column: column for column, one in file.sources.items()} if file else {}
     known = [(stated[name],) if name in stated else known_name(name) for name in names]
@@ -399,19 +430,23 @@ def table_bytes(values: FloatArray, kinds: Sequence[str]) -> bytes:
     return b"".join(parts)
 
 
+_MONITOR = re.compile(rb"^\d\d:\d\d:\d\d\.\d+ -> ?", re.MULTILINE)
+
+
 @contextmanager
 def open_text(path: Path) -> Iterator[BinaryIO]:
-    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them.
+    """A stream of a text file, of UTF-16 and of line ends without a line feed made UTF-8 with them, and
+    without the time that a serial monitor puts before each line.
 
-    Raises `BadInputError` for more than 128 MB of the latter.
+    Raises `BadInputError` for more than 128 MB of these.
     """
     with path.open("rb") as stream:
         start = stream.peek()
         wide = start.startswith((b"\xff\xfe", b"\xfe\xff"))
-        if wide or (b"\r" in start and b"\n" not in start):
+        if wide or (b"\r" in start and b"\n" not in start) or _MONITOR.match(start):
             data = read_bytes(path, _MOST_RECODED)
             data = data.decode("utf-16", "replace").encode() if wide else data
-            yield io.BytesIO(re.sub(rb"\r\n?", b"\n", data))
+            yield io.BytesIO(_MONITOR.sub(b"", re.sub(rb"\r\n?", b"\n", data)))
         else:
             yield stream
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -342,6 +343,14 @@ def test_any_message_gives_a_number_or_a_sentence(message: object, path: str) ->
         assert isinstance(value, float)
 
 
+def test_nothing_that_was_detected_is_a_blank() -> None:
+    read = reader_of("log", "/t", Field("u_px", "detections[0].x"))
+    assert math.isnan(read({"detections": []}))
+    assert read({"detections": [{"x": 7}]}) == 7.0
+    with pytest.raises(BadInputError, match="1 elements there"):
+        reader_of("log", "/t", Field("u_px", "data[1]"))({"data": [7]})
+
+
 MOST = 100_000
 
 
@@ -392,6 +401,9 @@ def _ros2(folder: Path, mode: str, padding: int) -> Path:
 def test_ros_2_bags_that_are_packed(mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = read_log(_ros2(tmp_path / "log", mode, 1))
     assert log.columns["v_px"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    if mode == "MESSAGE":
+        alone = read_log(next((tmp_path / "log").glob("*.db3")))
+        assert np.array_equal(alone.columns["v_px"], log.columns["v_px"])
     monkeypatch.setattr(log_unpacking, "MOST_BYTES", MOST)
     monkeypatch.setattr(log_unpacking, "_MOST_GROWTH", 3)
     with pytest.raises(BadInputError, match="unpacks to more than"):

@@ -389,3 +389,7 @@ def test_stamps_that_never_advance_tell_no_unit_of_rates(tmp_path: Path) -> None
         + "".join(f"1732784384,{0.01 * (k % 5):g},9.8,{k % 3}\n" for k in range(200))
     )
     assert len(read_log(path)) == 200
+    path.write_text(path.read_text().replace("t_s", "timestamp").replace("1732784384", "1.73E+09"))
+    words = "the time `timestamp` is 1730000000 in every row, expected it to advance"
+    with pytest.raises(BadInputError, match=words):
+        read_log(path)

@@ -116,6 +116,16 @@ def test_logs_of_utf_16_and_of_any_line_ends(tmp_path: Path, encoding: str, end:
     assert log_text(read_log(path)) == log_text(wanted)
 
 
+def test_units_in_the_code_page_of_windows(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    text = "Time (s);ax (m/s²);ay (m/s²);gz (°/s)\n" + "0,5;9,8;0,1;1,5\n0,6;9,8;0,1;1,5\n"
+    path.write_text(text, encoding="utf-8")
+    wanted = read_log(path)
+    path.write_text(text, encoding="cp1252")
+    assert log_text(read_log(path)) == log_text(wanted)
+    assert wanted.columns["gz_radps"][0] == pytest.approx(np.radians(1.5))
+
+
 @pytest.mark.parametrize(
     ("reader", "how"),
     # Logs of UTF-16 are read.

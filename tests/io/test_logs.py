@@ -60,6 +60,14 @@ def test_nan_and_infinite_cells_count_as_blank(write) -> None:
     assert log.sampled("gz_radps").tolist() == [0]
 
 
+@pytest.mark.parametrize("blank", ["NA", "null", "None", '""'])
+def test_what_programs_write_for_nothing_is_blank(write, blank: str) -> None:
+    text = f"t_s,u_px\n0,1\n1,{blank}\n2,3\n"
+    for form in (text, text + '3,"4 "\n'):
+        read = read_log(write(form)).columns["u_px"][:3]
+        np.testing.assert_array_equal(read, [1.0, np.nan, 3.0])
+
+
 def test_a_line_that_is_still_being_written_is_left_out(write) -> None:
     log = read_log(write(SMALL + "0.02,16"))
     assert log.passed.truncated
@@ -432,6 +440,33 @@ def test_times_may_be_dates(write, form: str, mark: str, zone: str) -> None:
         read_log(write(path.read_text() + f"1{mark}1\n"))
     with pytest.raises(BadInputError, match=r"line 3: t_s is '2024.*a number, or in all rows a date"):
         read_log(write(f"t_s{mark}u_px\n1{mark}1\n{dates[0]}{mark}1\n"))
+
+
+def test_times_of_day_run_on_past_midnight(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = datetime(2024, 2, 29, 23, 59, 58, 250_000)
+    times = [(start + timedelta(milliseconds=20 * k)).strftime("%H:%M:%S.%f")[:-3] for k in range(500)]
+    path = write("time,u_px\n" + "".join(f"{time},{k}\n" for k, time in enumerate(times)))
+    for size in (1 << 20, 1000):
+        monkeypatch.setattr(tables, "_BLOCK_BYTES", size)
+        log = read_log(path)
+        assert np.allclose(log.t_s, 86398.25 + 0.02 * np.arange(500), atol=1e-6, rtol=0.0)
+        assert log.passed.wraps == 1
+    with pytest.raises(BadInputError, match="line 3: t_s goes back"):
+        check_time(read_log(write("time,u_px\n12:00:01.0,1\n11:00:00,1\n11:00:01,2\n")))
+
+
+def test_what_a_serial_monitor_adds_is_passed_over(write) -> None:
+    """Its time before each line, what the board says between its rows, and the header once more."""
+    rows = [f"{10 * k},{k},1" for k in range(100)]
+    wanted = read_log(write("\n".join(["millis,u_px,v_px", *rows]) + "\n"))
+    said = ["millis,u_px,v_px", *rows[:40], "Pixy: no blocks, again", *rows[40:], "millis,u_px,v_px"]
+    log = read_log(write("".join(f"12:03:{k % 60:02d}.250 -> {line}\r\n" for k, line in enumerate(said))))
+    assert np.array_equal(log.t_s, wanted.t_s)
+    assert np.array_equal(log.columns["u_px"], wanted.columns["u_px"])
+    assert log.lines[39:41].tolist() == [41, 43]
+    assert "2 lines between the rows hold words and no number" in log.remarks()[-1]
+    with pytest.raises(BadInputError, match="line 102: has 2 cells, expected 3"):
+        read_log(write("\n".join(["millis,u_px,v_px", *rows, "lost 3 blocks,7"]) + "\n"))
 
 
 def test_dates_in_parquet(tmp_path: Path) -> None:
