@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -162,9 +162,23 @@ def shows_what_is_printed(block: str, where: str, folder: Path | None = None) ->
     return len(expected)
 
 
-_OTHER_FILES = ("live", "imu intrinsics", "identify arm", "identify pump", "identify stiffness", "record",
-                "track", "firmware --check", "fleet", "sweep", "doctor")  # fmt: skip
-"""Verbs whose blocks in the reference show recordings, a board, or what is installed."""
+_RECORDED = {"imu intrinsics": "imu_tk", "identify arm": "softarm", "identify pump": "softbot"}
+"""Verbs whose blocks in the manual show recordings, and the folders of these."""
+_OTHER_FILES = (
+    "live",
+    "identify stiffness",
+    "record",
+    "track",
+    "firmware --check",
+    "fleet",
+    "sweep",
+    "doctor",
+)
+"""Verbs whose blocks in the reference show a board, files of a person, or what is installed."""
+
+
+def shows(block: str, verbs: Iterable[str]) -> bool:
+    return block.startswith(tuple(f"$ calib {verb} " for verb in verbs))
 
 
 @pytest.mark.slow
@@ -172,7 +186,7 @@ def test_the_reference_prints_what_it_shows(tmp_path: Path) -> None:
     """Each block of output.md on the folder that its first command makes."""
     text, stale, compared = (MANUAL / "reference" / "output.md").read_text(encoding="utf-8"), [], 0
     for line, block in blocks(text, "console"):
-        if block.startswith(tuple(f"$ calib {verb}" for verb in _OTHER_FILES)):
+        if shows(block, (*_RECORDED, *_OTHER_FILES)):
             continue
         folder = tmp_path / "twin" if (tmp_path / "twin").exists() else tmp_path
         try:
@@ -181,6 +195,19 @@ def test_the_reference_prints_what_it_shows(tmp_path: Path) -> None:
             stale.append(str(error))
     assert not stale, "\n".join(stale)
     assert compared > 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", _RECORDED)
+def test_the_manual_shows_what_recordings_give(shared_data: Path, tmp_path: Path, verb: str) -> None:
+    for path in (shared_data / _RECORDED[verb]).iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    compared = 0
+    for page in ("reference/output.md", "howto/arm.md"):
+        for line, block in blocks((MANUAL / page).read_text(encoding="utf-8"), "console"):
+            if shows(block, [verb]):
+                compared += shows_what_is_printed(block, f"{page}, line {line}", tmp_path)
+    assert compared > 10
 
 
 def compare(expected: list[str], printed: list[str], where: str) -> None:
