@@ -38,11 +38,11 @@ Progress = Callable[[str], AbstractContextManager[ProgressCall]]
 """Opens a bar with a label, which is advanced by what it yields."""
 
 
-def later(module: str, name: str) -> Callable[[Any], Any]:
+def later(module: str, name: str) -> Callable[..., Any]:
     """A function of a module that is loaded as the function is called."""
 
-    def call(given: Any) -> Any:
-        return getattr(importlib.import_module(module), name)(given)
+    def call(*given: Any) -> Any:
+        return getattr(importlib.import_module(module), name)(*given)
 
     return call
 
@@ -194,7 +194,7 @@ class Stage:
     ----------
     name : words of its verb. title : its heading.
     summary : help of the verb and docstring of the function.
-    read : (files, rig, options) -> what `solve` takes. Raises `BadInputError`.
+    read : (files, rig, options) -> the arguments of `solve`. Raises `BadInputError`.
     solve : mathematics; a `Result`, a tuple of them in the order of `writes`, or a list of others.
     options : a dataclass of `option` fields.
     sources : help for the paths on the command line, "" for a stage without. several : whether there may
@@ -212,8 +212,8 @@ class Stage:
     name: str
     title: str
     summary: str
-    read: Callable[[Files, Rig, Any], Any]
-    solve: Callable[[Any], Any]
+    read: Callable[[Files, Rig, Any], tuple[Any, ...]]
+    solve: Callable[..., Any]
     options: type[Any] = NoOptions
     sources: str = ""
     several: bool = True
@@ -268,7 +268,7 @@ class Stage:
                 files.narrate(sentence)
         told.update(files.remarks)
         try:
-            return self.solve(inputs)
+            return self.solve(*inputs)
         except ValueError as error:
             # A fit to nonsense can end anywhere: with values that no section holds, or in a singular matrix.
             from numpy.linalg import LinAlgError

@@ -25,7 +25,6 @@ from calib.stages.imu.intrinsics import (
     ANGLES,
     PLACES,
     Accelerometer,
-    IntrinsicsInputs,
     Turns,
     _residual_and_jacobian,
     corrected,
@@ -487,7 +486,7 @@ def test_axes_and_units_that_contradict_are_inconsistent(good: Readings) -> None
 
 
 def _section(log: Readings, planar: bool = False) -> ImuIntrinsics:
-    section = solve_intrinsics(IntrinsicsInputs(log, G, planar))
+    section = solve_intrinsics(log, G, planar)
     again = Rig.of(yaml.safe_load(Rig(imu_intrinsics=section).text()), "rig.yaml").imu_intrinsics
     assert again is not None and section_json(again) == section_json(section)
     return section

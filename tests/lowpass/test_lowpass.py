@@ -50,7 +50,7 @@ from calib.stages.lowpass.filters import (
     spectrum,
     suggest,
 )
-from calib.stages.lowpass.stage import Inputs, positions_from_log, solve
+from calib.stages.lowpass.stage import positions_from_log, solve
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import marker_pixels
@@ -361,7 +361,7 @@ def test_without_a_rate_the_filter_has_that_of_the_logs_camera(tmp_path: Path) -
 
 
 def test_a_filter_that_single_precision_spoils_is_poor() -> None:
-    verdict = solve(Inputs(design_lowpass(Design(0.01, 60.0, 2)), WORKSPACE)).verdict
+    verdict = solve(design_lowpass(Design(0.01, 60.0, 2)), WORKSPACE).verdict
     assert verdict.word == "poor"
     assert "Rounded to single precision it cuts at" in verdict.reasons[0]
     assert "comes to rest up to" in verdict.reasons[1]

@@ -42,13 +42,13 @@ from calib.stages.camera.model import Camera, View, pack, project
 from calib.stages.camera.plane import Plane, calibrate_plane
 from calib.stages.camera.plots import _comparison, lens_plots, picture, plane_plots
 from calib.stages.camera.plots import plots as camera_plots
-from calib.stages.imu.intrinsics import IntrinsicsInputs, solve_intrinsics
+from calib.stages.imu.intrinsics import solve_intrinsics
 from calib.stages.imu.plots import intrinsics_plots, static_plots
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.static import solve_static
 from calib.stages.lowpass.filters import Design, Positions, design_lowpass
 from calib.stages.lowpass.plots import plots as lowpass_plots
-from calib.stages.lowpass.stage import Inputs, positions_from_log
+from calib.stages.lowpass.stage import positions_from_log
 from calib.stages.lowpass.stage import solve as solve_lowpass
 from synthetic import CAMERA, views_of
 
@@ -260,7 +260,7 @@ def _lens(camera: Camera) -> dict[str, Figure]:
 
 def _low_pass(cutoff: float, order: int, family: str, folder: Path, still: bool = False) -> dict[str, Figure]:
     made, seen = design_lowpass(Design(cutoff, 60.0, order, family)), _positions(folder, still)
-    return lowpass_plots(solve_lowpass(Inputs(made, WORKSPACE, seen)))
+    return lowpass_plots(solve_lowpass(made, WORKSPACE, seen))
 
 
 def _control(verb: str, *sources: str, **options: Any) -> dict[str, Figure]:
@@ -279,7 +279,7 @@ def _at_rest(axes: tuple[str, ...], stuck: bool = False) -> dict[str, Figure]:
 
 
 def _posed(poses: list[Rotation], planar: bool = False) -> dict[str, Figure]:
-    return intrinsics_plots(solve_intrinsics(IntrinsicsInputs(pose_log(poses, Sensor()), G, planar)))
+    return intrinsics_plots(solve_intrinsics(pose_log(poses, Sensor()), G, planar))
 
 
 def _settled() -> dict[str, Figure]:

@@ -53,24 +53,7 @@ def _with_states(files: Files, options: PoseOptions) -> list[tuple[Path, Path | 
     return [pair for pair in zip(files.named, states, strict=True) if pair[0] in files.paths]
 
 
-@dataclass(frozen=True)
-class LogsInputs:
-    """Tracks, the machine to start from, and what a person states of it with standard deviations.
-
-    Attributes
-    ----------
-    rig : holds what logs do not tell.
-    """
-
-    tracks: Sequence[Track]
-    nominal: Machine
-    stated: Mapping[str, float]
-    rig: Rig
-    options: LogsOptions
-    progress: Progress
-
-
-def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
+def _read(files: Files, rig: Rig, options: LogsOptions) -> tuple[Any, ...]:
     from calib.stages.actuator.read import read_track
     from calib.stages.actuator.results import beginning
 
@@ -80,19 +63,26 @@ def _read(files: Files, rig: Rig, options: LogsOptions) -> LogsInputs:
         read_track(files, path, rig, nominal, options, states)
         for path, states in _with_states(files, options)
     ]
-    return LogsInputs(tracks, nominal, stated, rig, options, files.progress)
+    return tracks, nominal, stated, rig, options, files.progress
 
 
-def _solve(inputs: LogsInputs) -> Sections:
+def _solve(
+    tracks: Sequence[Track],
+    nominal: Machine,
+    stated: Mapping[str, float],
+    rig: Rig,
+    options: LogsOptions,
+    progress: Progress,
+) -> Sections:
+    """From tracks, the machine to start from, and what a person states of it with standard deviations."""
     from calib.stages.actuator.results import identify_logs, sections_from
 
-    options, known = inputs.options, inputs.rig.known
-    with inputs.progress("identifying") as progress:
+    either_law = rig.known is None or rig.known.pump is None or rig.known.pump.deflation is None
+    with progress("identifying") as tell:
         found = identify_logs(
-            inputs.nominal, inputs.tracks, options.static_map, options.hold_back, progress, inputs.stated,
-            either_law=known is None or known.pump is None or known.pump.deflation is None,
-        )  # fmt: skip
-    return sections_from(found, inputs.rig)
+            nominal, tracks, options.static_map, options.hold_back, tell, stated, either_law=either_law
+        )
+    return sections_from(found, rig)
 
 
 def _document(sections: Sections) -> dict[str, Any]:
@@ -216,17 +206,8 @@ class PumpOptions:
     unit: Literal["kPa", "N"] | None = option(None, "Unit of that column.")
 
 
-@dataclass(frozen=True)
-class PumpInputs:
+def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> tuple[Any, ...]:
     """Tables to fit and tables to predict, and the rig with what it holds of a pump."""
-
-    tables: Sequence[PumpTable]
-    kept_out: Sequence[PumpTable]
-    rig: Rig
-    progress: Progress
-
-
-def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
     from calib.stages.actuator.read import read_pump_table
 
     columns = (options.time, options.pwm, options.value, options.unit)
@@ -238,15 +219,17 @@ def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> PumpInputs:
         tables.append(replace(table, record=record))
     kept_out = [read_pump_table(path, *columns) for path in expanded(options.held)]
     files.merged = ("pump",)
-    return PumpInputs(tables, kept_out, rig, files.progress)
+    return tables, kept_out, rig, files.progress
 
 
-def _solve_pump(inputs: PumpInputs) -> PumpSection:
+def _solve_pump(
+    tables: Sequence[PumpTable], kept_out: Sequence[PumpTable], rig: Rig, progress: Progress
+) -> PumpSection:
     from calib.stages.actuator.identify_pump import identify_pump, pump_section
 
-    with inputs.progress("identifying") as progress:
-        found = identify_pump(inputs.tables, inputs.kept_out, progress)
-    return pump_section(found, inputs.rig).with_evidence(found)
+    with progress("identifying") as tell:
+        found = identify_pump(tables, kept_out, tell)
+    return pump_section(found, rig).with_evidence(found)
 
 
 def _pump_document(section: PumpSection) -> dict[str, Any]:
@@ -343,21 +326,16 @@ class StiffnessOptions:
 
 @dataclass(frozen=True)
 class Springs:
-    """A table's elongations [m] and forces [N], and the rig with what it holds of the actuator.
+    """A table's elongations [m] and forces [N], the laws that were fitted, and which of these is used."""
 
-    `fits` are the laws that were fitted to them, `used` which of these is used.
-    """
-
-    name: str
     elongation_m: FloatArray
     force_N: FloatArray
     per: str
-    rig: Rig
-    fits: Sequence[StiffnessFit] = ()
-    used: int = 0
+    fits: Sequence[StiffnessFit]
+    used: int
 
 
-def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> Springs:
+def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> tuple[Any, ...]:
     from calib.stages.actuator.read import read_displacements
 
     (path,) = files.paths
@@ -366,16 +344,18 @@ def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> Spring
     files.hashes |= rig.provenance.inputs.get("actuator", {})
     files.merged = ("actuator",)
     files.taken(path)
-    return Springs(shown(path), elongation_m, force_N, options.per, rig)
+    return shown(path), elongation_m, force_N, options.per, rig
 
 
-def _solve_stiffness(inputs: Springs) -> Actuator:
+def _solve_stiffness(
+    name: str, elongation_m: FloatArray, force_N: FloatArray, per: Literal["actuator", "bellows"], rig: Rig
+) -> Actuator:
     from calib.stages.actuator.identify import fit_stiffness
     from calib.stages.actuator.results import stiffness_section
 
-    fits, best = fit_stiffness(inputs.name, inputs.elongation_m, inputs.force_N)
-    section = stiffness_section(fits[best], inputs.per == "actuator", inputs.rig)
-    return section.with_evidence(replace(inputs, fits=fits, used=best))
+    fits, best = fit_stiffness(name, elongation_m, force_N)
+    section = stiffness_section(fits[best], per == "actuator", rig)
+    return section.with_evidence(Springs(elongation_m, force_N, per, fits, best))
 
 
 def _stiffness_document(section: Actuator) -> dict[str, Any]:
@@ -442,15 +422,6 @@ class ValidateOptions(PoseOptions):
 
 
 @dataclass(frozen=True)
-class ValidateInputs:
-    """Tracks of the actuator with the estimator's starts, or trials of an arm, and the rig."""
-
-    tracks: Sequence[tuple[Track, Start | None]]
-    trials: Sequence[Trial]
-    rig: Rig
-
-
-@dataclass(frozen=True)
 class Validated:
     """What models show in place of logs.
 
@@ -464,7 +435,8 @@ class Validated:
     verdict: Verdict = Verdict()
 
 
-def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> ValidateInputs:
+def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> tuple[Any, ...]:
+    """Tracks of the actuator with the estimator's starts, or trials of an arm, and the rig."""
     from calib.io.columns import is_arm_log
     from calib.io.logs import columns_of
     from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
@@ -477,7 +449,7 @@ def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validate
         from calib.stages.arm.stage import Options, held_trials
 
         arm_options = Options(columns=options.columns, load=options.load, day=options.day)
-        return ValidateInputs((), held_trials(files, arm, arm_options), rig)
+        return (), held_trials(files, arm, arm_options), rig
     files.hashes |= rig.identities("camera", "plane", "align", "actuator", "pump")
     tracks = [begun_track(files, path, rig, options, states) for path, states in logs]
     if IMPROVED not in models_of(rig):
@@ -485,21 +457,22 @@ def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> Validate
             f"{shown(files.rig_path)} has no section known, actuator or pump: the improved model has "
             "nominal parameters"
         )
-    return ValidateInputs(tracks, (), rig)
+    return tracks, (), rig
 
 
-def _solve_validate(inputs: ValidateInputs) -> Validated:
+def _solve_validate(
+    tracks: Sequence[tuple[Track, Start | None]], trials: Sequence[Trial], rig: Rig
+) -> Validated:
     from calib.stages.actuator.validate import compare, models_of
 
-    if inputs.trials:
+    if trials:
         from calib.stages.arm.identify import errors_by
 
-        arm = inputs.rig.arm
-        assert arm is not None
-        held = {one.name: errors_by(arm.values_on(one.day), one) for one in inputs.trials}
+        assert rig.arm is not None
+        held = {one.name: errors_by(rig.arm.values_on(one.day), one) for one in trials}
         return Validated(held=held)
-    models = models_of(inputs.rig)
-    return Validated(tuple(compare(track, models, start) for track, start in inputs.tracks))
+    models = models_of(rig)
+    return Validated(tuple(compare(track, models, start) for track, start in tracks))
 
 
 def _validate_document(outcome: Validated) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from calib.core.errors import BadInputError
@@ -35,19 +35,7 @@ _SIGNED = ("ax_mps2", "ay_mps2", "gz_radps")
 """Columns of `geometry.imu_sign`."""
 
 
-@dataclass(frozen=True)
-class AlignInputs:
-    """Readings, what is known beforehand, the drawing of the marker, None where it was measured, and by
-    column the sign with which the logs were read, where the board has another one.
-    """
-
-    logs: Sequence[AlignLog]
-    settings: Settings
-    drawn: Geometry | None
-    signs: Mapping[str, int] = field(default_factory=dict)
-
-
-def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
+def _read(files: Files, rig: Rig, options: AlignOptions) -> tuple[Any, ...]:
     from calib.core.rig import Geometry
     from calib.io.logs import read_log
     from calib.stages.align.read import align_log, settings_from_rig
@@ -71,11 +59,19 @@ def _read(files: Files, rig: Rig, options: AlignOptions) -> AlignInputs:
         raise BadInputError(files.remarks[-1])
     settings = settings_from_rig(rig, files.rig_path, logs, options.marker_offset_m)
     drawn = None if options.marker_offset_m is not None else rig.geometry or Geometry()
-    return AlignInputs(logs, settings, drawn, signs)
+    return logs, settings, drawn, signs
 
 
-def _solve(inputs: AlignInputs) -> Align:
-    """Fit, judge by the logs alone, weigh the drawing in, and assemble the section."""
+def _solve(
+    logs: Sequence[AlignLog], settings: Settings, drawing: Geometry | None, signs: Mapping[str, int]
+) -> Align:
+    """Fit, judge by the logs alone, weigh the drawing in, and assemble the section.
+
+    Parameters
+    ----------
+    drawing : of the marker, None where it was measured.
+    signs : by column that with which the logs were read, where the board has another one.
+    """
     import numpy as np
 
     from calib.core.result import CovarianceTable, finite_or_none, judged
@@ -84,15 +80,15 @@ def _solve(inputs: AlignInputs) -> Align:
     from calib.stages.align.solve import judge, with_drawn_marker
     from calib.stages.estimator.sensors import SENSOR
 
-    found = fit(inputs.logs, inputs.settings)
+    found = fit(logs, settings)
     verdict = judge(found)
-    if inputs.drawn is not None:
-        found, drawn = with_drawn_marker(found, inputs.drawn)
+    if drawing is not None:
+        found, drawn = with_drawn_marker(found, drawing)
         verdict = Verdict.of([*verdict.findings, drawn])
-    if inputs.signs:
-        names = ", ".join(inputs.signs)
+    if signs:
+        names = ", ".join(signs)
         text = f"{names}: the sign is turned where the logs are read, or on the board, alone"
-        wanted = ", ".join(f"{sign:d} for {name}" for name, sign in inputs.signs.items())
+        wanted = ", ".join(f"{sign:d} for {name}" for name, sign in signs.items())
         state = f"the board reads the sensor itself: state {wanted} in geometry.imu_sign, of ax, ay and gz"
         verdict = Verdict.of([*verdict.findings, Finding("poor", text, state)])
 

@@ -55,17 +55,6 @@ class Options(LogOptions):
     )
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """Trials, how motion capture is read, and what the recordings show."""
-
-    trials: tuple[Trial, ...]
-    frame: Frame
-    findings: tuple[Finding, ...]
-    compare: bool
-    progress: Progress
-
-
 def _said(words: Iterable[str], flag: str, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Names of logs and what is stated of them. Raises `UsageError` for names that are none."""
     for one in words:
@@ -125,29 +114,31 @@ def read_trials(
     return trials, found, (*findings, *frame_findings(found))
 
 
-def _read(files: Files, rig: Rig, options: Options) -> Inputs:
+def _read(files: Files, rig: Rig, options: Options) -> tuple[Any, ...]:
     del rig
-    trials, frame, findings = read_trials(files, options)
-    return Inputs(trials, frame, findings, options.compare, files.progress)
+    return *read_trials(files, options), options.compare, files.progress
 
 
-def _solve(inputs: Inputs) -> Arm:
+def _solve(
+    trials: Sequence[Trial], frame: Frame, findings: Sequence[Finding], compare: bool, progress: Progress
+) -> Arm:
+    """From trials, how motion capture is read, and what the recordings show."""
     from calib.core.result import finite_or_none, judged
     from calib.stages.arm.identify import QUANTITIES, half_width, identify, mean_of
     from calib.stages.arm.section import Arm, HeldTrial
 
-    with inputs.progress("identifying") as progress:
-        found = identify(inputs.trials, inputs.compare, progress)
+    with progress("identifying") as tell:
+        found = identify(trials, compare, tell)
     made = found.fit
-    axis = inputs.frame.axis
+    axis = frame.axis
     return Arm(
         parts=list(made.assembly.parts),
         parameters={name: float(made.values[name]) for name in made.assembly.names},
         sigma={name: float(value) for name, value in found.sigma.items()},
         days={day: dict(factors) for day, factors in made.days.items()},
         bending_axis=None if axis is None else axis.tolist(),
-        conjugated=inputs.frame.conjugated,
-        chord_leans=finite_or_none(abs(inputs.frame.leans)),
+        conjugated=frame.conjugated,
+        chord_leans=finite_or_none(abs(frame.leans)),
         angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
         chord_error_m=finite_or_none(mean_of(found.held, "chord_m")),
         by_pressure_error_rad=finite_or_none(mean_of(found.held, "angle_by_pressure_rad")),
@@ -157,7 +148,7 @@ def _solve(inputs: Inputs) -> Arm:
             name: HeldTrial(**{quantity: finite_or_none(one[quantity]) for quantity in QUANTITIES})
             for name, one in found.held.items()
         },
-        **judged(Verdict.of((*inputs.findings, *judge(found)))),
+        **judged(Verdict.of((*findings, *judge(found)))),
     ).with_evidence(found)
 
 

@@ -29,16 +29,8 @@ if TYPE_CHECKING:
 # `calib intrinsics`: pictures or a table of correspondences in, the camera with error bars out.
 
 
-@dataclass(frozen=True)
-class IntrinsicsInputs:
+def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> tuple[Any, ...]:
     """Views of a target, how to calibrate, and how long it took to find the views."""
-
-    found: ViewSet
-    options: IntrinsicsOptions
-    detect_s: float
-
-
-def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
     import time
 
     from calib.stages.camera.read import read_views
@@ -50,10 +42,10 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     for remark in views.remarks:
         files.narrate(remark)
     files.hashes.update(views.hashes)
-    return IntrinsicsInputs(views, options, time.perf_counter() - began)
+    return views, options, time.perf_counter() - began
 
 
-def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
+def _solve_intrinsics(found: ViewSet, options: IntrinsicsOptions, detect_s: float) -> Camera:
     """Calibrate, judge, and assemble the section."""
     import numpy as np
 
@@ -64,8 +56,7 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
     from calib.stages.camera.model import ahead_radius, distorted_normalised
     from calib.stages.camera.section import Camera
 
-    views = inputs.found
-    result = calibrate_camera(views.views, views.image_size_px, inputs.options, views.left_out)
+    result = calibrate_camera(found.views, found.image_size_px, options, found.left_out)
     fit, known = result.calibration, result.covariance
     width, height = fit.camera.image_size_px
     grid = box_grid((0.0, 0.0, width - 1.0, height - 1.0), 17, 13).reshape(-1, 2)
@@ -94,9 +85,9 @@ def _solve_intrinsics(inputs: IntrinsicsInputs) -> Camera:
         loss=fit.loss,
         termination=fit.termination,
         rejected=[str(one) for one in result.left_out if one.kind in ("copy", "view", "points")],
-        simulated=views.simulated,
+        simulated=found.simulated,
         **judged(result.verdict),
-    ).with_evidence(replace(result, seconds={"detect": inputs.detect_s, **result.seconds}))
+    ).with_evidence(replace(result, seconds={"detect": detect_s, **result.seconds}))
 
 
 def _optics(camera: model.Camera) -> dict[str, Any]:
@@ -213,19 +204,6 @@ intrinsics = Stage(
 
 
 @dataclass(frozen=True)
-class PlaneInputs:
-    """Views of the board in world metres, and the camera that saw them."""
-
-    camera: Camera
-    views: Sequence[model.View]
-    workspace_m: tuple[float, float, float, float]
-    orientation: tuple[str, ...]
-    doubt: str
-    left_out: tuple[LeftOut, ...]
-    simulated: bool
-
-
-@dataclass(frozen=True)
 class PlaneEvidence:
     """What a plane was made from."""
 
@@ -234,7 +212,7 @@ class PlaneEvidence:
     left_out: tuple[LeftOut, ...]
 
 
-def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
+def _read_plane(files: Files, rig: Rig, options: NoOptions) -> tuple[Any, ...]:
     from calib.core.files import shown
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
@@ -279,19 +257,19 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> PlaneInputs:
         views.append(View(view.name, world_m[kept], pixels[kept]))
         orientation.append(f"{view.name}: {how}")
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
-    return PlaneInputs(
-        rig.camera,
-        views,
-        rig.workspace_m,
-        tuple(orientation),
-        doubt,
-        search.left_out,
-        stated.simulated,
-    )
+    return rig.camera, views, rig.workspace_m, orientation, doubt, search.left_out, stated.simulated
 
 
-def _solve_plane(inputs: PlaneInputs) -> Plane:
-    """Fit, judge, and assemble the section."""
+def _solve_plane(
+    camera: Camera,
+    views: Sequence[model.View],
+    workspace_m: tuple[float, float, float, float],
+    orientation: Sequence[str],
+    doubt: str,
+    left_out: tuple[LeftOut, ...],
+    simulated: bool,
+) -> Plane:
+    """Fit views of the board in world metres, judge, and assemble the section."""
     import numpy as np
 
     from calib.core.result import finite_or_none, judged
@@ -299,18 +277,12 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
     from calib.stages.camera.plane import calibrate_plane
     from calib.stages.camera.section import Plane
 
-    optics = inputs.camera.optics
-    fit = calibrate_plane(
-        optics,
-        inputs.camera.intrinsic_covariance,
-        inputs.views,
-        workspace_m=inputs.workspace_m,
-        camera_rms_px=inputs.camera.rms_px,
-    )
+    optics, covariance = camera.optics, camera.intrinsic_covariance
+    fit = calibrate_plane(optics, covariance, views, workspace_m=workspace_m, camera_rms_px=camera.rms_px)
     findings = [*fit.verdict.findings]
-    if inputs.doubt:
+    if doubt:
         advice = "state which it is with first_corner_px: [u, v] in board.yaml"
-        findings.append(Finding("poor", inputs.doubt, advice))
+        findings.append(Finding("poor", doubt, advice))
     sigma = np.sqrt(np.diag(fit.covariance))
     names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
     parts = ("intrinsics", "plane", "calibration", "quantisation", "total")
@@ -340,10 +312,10 @@ def _solve_plane(inputs: PlaneInputs) -> Plane:
         without_intrinsics=without,
         pictures=len(fit.pictures),
         points=len(fit.corners_m),
-        orientation=" ".join(inputs.orientation),
-        simulated=inputs.simulated,
+        orientation=" ".join(orientation),
+        simulated=simulated,
         **judged(Verdict.of(findings)),
-    ).with_evidence(PlaneEvidence(optics, fit, inputs.left_out))
+    ).with_evidence(PlaneEvidence(optics, fit, left_out))
 
 
 def _plane_words(result: Plane) -> list[Block]:
@@ -403,16 +375,7 @@ class LensOptions:
     )
 
 
-@dataclass(frozen=True)
-class LensInputs:
-    """A camera, what is needed of its plane, and a region of interest."""
-
-    camera: Camera
-    plane: lens.PlaneView | None
-    region_px: tuple[float, float, float, float] | None
-
-
-def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
+def _read_lens(files: Files, rig: Rig, options: LensOptions) -> tuple[Any, ...]:
     import numpy as np
 
     from calib.stages.camera.lens import PlaneView
@@ -424,16 +387,15 @@ def _read_lens(files: Files, rig: Rig, options: LensOptions) -> LensInputs:
     if current is not None:
         sigma_mm = current.sigma_marker_mm.get("calibration_max")
         view = PlaneView(np.array(current.R_CW), np.array(current.t_CW_m), rig.workspace_m, sigma_mm)
-    return LensInputs(rig.camera, view, options.region_px)
+    return rig.camera, view, options.region_px
 
 
-def _solve_lens(inputs: LensInputs) -> Lens:
+def _solve_lens(
+    camera: Camera, plane: lens.PlaneView | None, region_px: tuple[float, float, float, float] | None
+) -> Lens:
     from calib.stages.camera.lens import analyse_distortion
 
-    camera = inputs.camera
-    return analyse_distortion(
-        camera.optics, camera.intrinsic_covariance, plane=inputs.plane, region_px=inputs.region_px
-    )
+    return analyse_distortion(camera.optics, camera.intrinsic_covariance, plane=plane, region_px=region_px)
 
 
 def _lens_words(result: Lens) -> list[Block]:

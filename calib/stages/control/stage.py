@@ -100,19 +100,6 @@ class RunOptions:
 
 
 @dataclass(frozen=True)
-class RunInputs:
-    """A machine, controllers by name, and the reference that they follow."""
-
-    machine: SimulatedRig
-    model: Model
-    wanted: Reference
-    controllers: Sequence[str]
-    section: Controller | None
-    options: RunOptions
-    progress: Progress
-
-
-@dataclass(frozen=True)
 class Runs:
     """How well controllers follow a reference.
 
@@ -136,7 +123,7 @@ class Runs:
         return Verdict((Finding("remark", text),))
 
 
-def _read_run(files: Files, rig: Rig, options: RunOptions) -> RunInputs:
+def _read_run(files: Files, rig: Rig, options: RunOptions) -> tuple[Any, ...]:
     from calib.stages.control.trial import CONTROLLERS, controllers_for
 
     for name in options.controllers or ():
@@ -146,22 +133,27 @@ def _read_run(files: Files, rig: Rig, options: RunOptions) -> RunInputs:
     names = options.controllers or controllers_for(wanted, rig.controller)
     files.narrate("simulated: a model of a rig, not the rig")
     files.hashes |= rig.identities("actuator", "pump", "controller")
-    return RunInputs(machine, model, wanted, names, rig.controller, options, files.progress)
+    return machine, model, wanted, names, rig.controller, options, files.progress
 
 
-def _solve_run(inputs: RunInputs) -> Runs:
+def _solve_run(
+    machine: SimulatedRig,
+    model: Model,
+    wanted: Reference,
+    controllers: Sequence[str],
+    section: Controller | None,
+    options: RunOptions,
+    progress: Progress,
+) -> Runs:
     from calib.stages.control.trial import run_controller
     from calib.stages.control.tuning import follow
 
-    model, wanted, options = inputs.model, inputs.wanted, inputs.options
     outcomes = []
-    with inputs.progress("simulating") as progress:
-        for done, name in enumerate(inputs.controllers):
-            progress(done, len(inputs.controllers))
+    with progress("simulating") as tell:
+        for done, name in enumerate(controllers):
+            tell(done, len(controllers))
             outcomes.append(
-                run_controller(
-                    name, inputs.machine, model, wanted, inputs.section, options.seed, options.feedback
-                )
+                run_controller(name, machine, model, wanted, section, options.seed, options.feedback)
             )
     found = follow(model, wanted.path_m(model.plant.rest_length_m))
     return Runs(model, wanted, found, outcomes, options)
@@ -293,15 +285,13 @@ class Checked:
 
 
 def _read_check(files: Files, rig: Rig, options: CheckOptions) -> tuple[Model, Reference]:
-    _, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits)
-    return model, wanted
+    return _wanted(files, rig, options.duration_s, options.pwm_limits)[1:]
 
 
-def _solve_check(inputs: tuple[Model, Reference]) -> Checked:
+def _solve_check(model: Model, wanted: Reference) -> Checked:
     from calib.stages.control.references import from_lengths
     from calib.stages.control.tuning import follow, slowed
 
-    model, wanted = inputs
     path_m = wanted.path_m(model.plant.rest_length_m)
     found = follow(model, path_m)
     if found.possible:
@@ -417,17 +407,6 @@ class TuneOptions:
 
 
 @dataclass(frozen=True)
-class TuneInputs:
-    """A machine, what controllers know of it, what is asked of them, and sections that nobody has filled."""
-
-    machine: SimulatedRig
-    model: Model
-    criterion: ControllerCriterion
-    progress: Progress
-    nominal: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class ControllerEvidence:
     """What gains were chosen from."""
 
@@ -436,7 +415,7 @@ class ControllerEvidence:
     position: Tuned
 
 
-def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
+def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> tuple[Any, ...]:
     from calib.stages.control.section import ControllerCriterion
     from calib.stages.control.trial import controlled
 
@@ -454,11 +433,20 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     # Of lowpass and align the delays alone count: an alignment with a poor mount angle spoils no gains.
     files.hashes |= rig.identities("known", "actuator", "pump")
     nominal = [name for name, values in rig.standing.items() if not values]
-    return TuneInputs(machine, model, criterion, files.progress, nominal)
+    return machine, model, criterion, files.progress, nominal
 
 
-def _solve_tune(inputs: TuneInputs) -> Controller:
-    """Tune both loops on the model and the anti-windup by trial, judge, and assemble the section."""
+def _solve_tune(
+    machine: SimulatedRig,
+    model: Model,
+    criterion: ControllerCriterion,
+    progress: Progress,
+    nominal: Sequence[str],
+) -> Controller:
+    """Tune both loops on the model and the anti-windup by trial, judge, and assemble the section.
+
+    `nominal` are the sections that nobody has filled.
+    """
     from calib.core.result import finite_or_none, judged
     from calib.stages.actuator.pump import RateLimit
     from calib.stages.control.laws import ComputedTorque, design_observer
@@ -472,13 +460,12 @@ def _solve_tune(inputs: TuneInputs) -> Controller:
     from calib.stages.control.trial import tune_back_calculation
     from calib.stages.control.tuning import tune_orientation, tune_position
 
-    model, criterion, tracker = inputs.model, inputs.criterion, inputs.machine.tracker
     orientation, position = tune_orientation(model, criterion), tune_position(model, criterion)
     turn, move = orientation.pid, position.pid
-    with inputs.progress("anti-windup") as progress:
-        back_s, share, trials = tune_back_calculation(inputs.machine, model, turn, progress)
+    with progress("anti-windup") as tell:
+        back_s, share, trials = tune_back_calculation(machine, model, turn, tell)
     anti_windup = {name: AntiWindup(**values) for name, values in trials.items()}
-    torque = ComputedTorque()
+    torque, tracker = ComputedTorque(), machine.tracker
     observer = design_observer(model, latency_s=tracker.latency_s, marker_offset_m=tracker.marker_offset_m)
     law = model.pump.deflation
     return Controller(
@@ -507,7 +494,7 @@ def _solve_tune(inputs: TuneInputs) -> Controller:
         falling_N_per_s=finite_or_none(law.falling_N_per_s) if isinstance(law, RateLimit) else None,
         margins=[*_margins("orientation", orientation.points), *_margins("position", position.points)],
         anti_windup=anti_windup,
-        **judged(_judge(anti_windup["clamping"], anti_windup["back_calculation"], model, inputs.nominal)),
+        **judged(_judge(anti_windup["clamping"], anti_windup["back_calculation"], model, nominal)),
     ).with_evidence(ControllerEvidence(model, orientation, position))
 
 

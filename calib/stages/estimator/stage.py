@@ -39,17 +39,7 @@ class ReplayOptions(LogOptions):
     tune: bool = option(False, "Learn the noise from these logs; written to the rig's file.")
 
 
-@dataclass(frozen=True)
-class ReplayInputs:
-    """Logs with the files for their states, and the rig."""
-
-    files: Files
-    rig: Rig
-    options: ReplayOptions
-    outputs: Sequence[Path | None]
-
-
-def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
+def _read(files: Files, rig: Rig, options: ReplayOptions) -> tuple[Any, ...]:
     from calib.core.writing import check_folder, check_writable, make_folder
     from calib.io.states import STATES_FILE
 
@@ -66,7 +56,7 @@ def _read(files: Files, rig: Rig, options: ReplayOptions) -> ReplayInputs:
         files.hashes |= rig.identities("camera", "plane", "imu", "align")
         for path in files.paths:
             files.taken(path)
-    return ReplayInputs(files, rig, options, outputs)
+    return files, rig, options, outputs
 
 
 def _names(paths: Sequence[Path], folder: Path, ending: str) -> list[Path | None]:
@@ -90,11 +80,11 @@ def _names(paths: Sequence[Path], folder: Path, ending: str) -> list[Path | None
     return out
 
 
-def _solve(inputs: ReplayInputs) -> list[Replayed]:
+def _solve(files: Files, rig: Rig, options: ReplayOptions, outputs: Sequence[Path | None]) -> list[Replayed]:
+    """From logs with the files for their states."""
     from calib.core.files import shown
     from calib.stages.estimator.replay import replay_log
 
-    files, rig, options = inputs.files, inputs.rig, inputs.options
     tuned = None
     if options.tune:
         from calib.stages.estimator.tuning import tuned_section
@@ -104,7 +94,7 @@ def _solve(inputs: ReplayInputs) -> list[Replayed]:
         tuned.made_by("replay", files.hashes)
         rig = rig.with_sections({"estimator": tuned})
     results = []
-    for path, output in zip(files.paths, inputs.outputs, strict=True):
+    for path, output in zip(files.paths, outputs, strict=True):
         with files.one_of_several(path), files.progress(f"replaying {path.name}") as progress:
             result = replay_log(
                 path,

@@ -29,33 +29,24 @@ class FirmwareOptions:
     )
 
 
-@dataclass(frozen=True)
-class FirmwareInputs:
-    """A rig with its file's name, and the frames of a board with the name of their log."""
-
-    rig: Rig
-    source: str
-    frames: Sequence[Frame] | None = None
-    log: str = ""
-
-
-def _read(files: Files, rig: Rig, options: FirmwareOptions) -> FirmwareInputs:
+def _read(files: Files, rig: Rig, options: FirmwareOptions) -> tuple[Any, ...]:
     source = shown(files.rig_path)
     if options.check is None:
-        return FirmwareInputs(rig, source)
+        return rig, source
     from calib.stages.firmware.check import read_frames
 
     log = Path(options.check)
     rig.needed("plane", files.rig_path, ", so no board can run it")
-    return FirmwareInputs(rig, source, read_frames(log), shown(log))
+    return rig, source, read_frames(log), shown(log)
 
 
-def _solve(inputs: FirmwareInputs) -> Header | Check:
+def _solve(rig: Rig, source: str, frames: Sequence[Frame] | None = None, log: str = "") -> Header | Check:
+    """From a rig with its file's name, and the frames of a board with the name of their log."""
     from calib.stages.firmware.check import check_frames
     from calib.stages.firmware.header import header_of
 
-    header = header_of(inputs.rig, inputs.source)
-    return header if inputs.frames is None else check_frames(header, inputs.frames, inputs.log)
+    header = header_of(rig, source)
+    return header if frames is None else check_frames(header, frames, log)
 
 
 def _write(files: Files, outcome: Header | Check) -> list[Path]:

@@ -437,27 +437,26 @@ _ABOUT = {
 }
 
 
-@dataclass(frozen=True)
-class DriftInputs:
-    """Logs, their hashes, the rig's gains, and whether filters of others run."""
+def solve_drift(
+    logs: Sequence[Readings],
+    hashes: dict[str, str],
+    tuned: Tuned | None,
+    peers: bool,
+    narrate: Callable[[str], None],
+) -> Drift:
+    """Every way of getting the angle on every log, and how each drifts.
 
-    logs: Sequence[Readings]
-    hashes: dict[str, str]
-    tuned: Tuned | None
-    peers: bool
-    narrate: Callable[[str], None]
-
-
-def solve_drift(inputs: DriftInputs) -> Drift:
-    """Every way of getting the angle on every log, and how each drifts."""
-    tuned = inputs.tuned
-    logs = [analyse_drift(log, tuned, inputs.peers, inputs.narrate) for log in inputs.logs]
-    sections = [log.section for log in logs]
+    Parameters
+    ----------
+    hashes : of the logs. tuned : the rig's gains. peers : whether filters of others run.
+    """
+    analysed = [analyse_drift(log, tuned, peers, narrate) for log in logs]
+    sections = [log.section for log in analysed]
     return Drift(
         note=NOT_A_RANKING,
         logs=sections,
         methods=spread_of(sections),
-        provenance={"inputs": inputs.hashes},
+        provenance={"inputs": hashes},
         tuned=None
         if tuned is None
         else DriftGains(
@@ -465,8 +464,8 @@ def solve_drift(inputs: DriftInputs) -> Drift:
             **parameters_of(tuned.gains),
             rate_of_angle="up vector" if tuned.up_vector else "-gz",
         ),
-        **judged(Verdict.of(sensor_findings(inputs.logs))),
-    ).with_evidence(logs)
+        **judged(Verdict.of(sensor_findings(logs))),
+    ).with_evidence(analysed)
 
 
 def _remarks(log: Readings, sampling: Sampling, truth_late_s: float) -> Iterator[str]:

@@ -1202,18 +1202,9 @@ def judge_intrinsics(result: Intrinsics) -> Verdict:
 # The section.
 
 
-@dataclass(frozen=True)
-class IntrinsicsInputs:
-    """A log of rests in many poses, gravity there, and whether x, y and gz alone are calibrated."""
-
-    log: Readings
-    gravity_mps2: float
-    planar: bool = False
-
-
-def solve_intrinsics(inputs: IntrinsicsInputs) -> ImuIntrinsics:
+def solve_intrinsics(log: Readings, gravity_mps2: float, planar: bool = False) -> ImuIntrinsics:
     """Calibrate, judge, and assemble the section; what the log does not tell is null."""
-    result = find_intrinsics(inputs.log, inputs.gravity_mps2, inputs.planar)
+    result = find_intrinsics(log, gravity_mps2, planar)
     return ImuIntrinsics(
         gravity_mps2=result.gravity_mps2,
         planar=result.planar,

@@ -19,12 +19,10 @@ if TYPE_CHECKING:
 
     from calib.core.rig import Rig
     from calib.io.logs import Log
-    from calib.stages.imu.drift import DriftInputs
-    from calib.stages.imu.intrinsics import IntrinsicsInputs
     from calib.stages.imu.mahony import AngleFilter
     from calib.stages.imu.sampling import Readings
     from calib.stages.imu.section import Drift, Imu, OrientationFilter
-    from calib.stages.imu.tuning import TuneInputs, TuneLog
+    from calib.stages.imu.tuning import TuneLog
 
 
 def _readings(files: Files, options: LogOptions, read: Callable[[Log], Readings]) -> list[Readings]:
@@ -39,11 +37,11 @@ def _readings(files: Files, options: LogOptions, read: Callable[[Log], Readings]
 # `calib imu static`: logs of an IMU at rest in, its bias, noise and drift out.
 
 
-def _read_static(files: Files, rig: Rig, options: LogOptions) -> list[Readings]:
+def _read_static(files: Files, rig: Rig, options: LogOptions) -> tuple[list[Readings]]:
     from calib.stages.imu.read import rest_log
 
     del rig
-    return _readings(files, options, rest_log)
+    return (_readings(files, options, rest_log),)
 
 
 def _imu_yaml() -> Kind:
@@ -102,9 +100,8 @@ class IntrinsicsOptions(LogOptions):
     planar: bool = option(False, "Calibrate ax, ay and gz alone, from tilts about z.")
 
 
-def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> IntrinsicsInputs:
+def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> tuple[Any, ...]:
     from calib.io.logs import read_log
-    from calib.stages.imu.intrinsics import IntrinsicsInputs
     from calib.stages.imu.read import pose_log, read_pose_files
 
     del rig
@@ -122,7 +119,7 @@ def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> Intr
     for path in (*files.paths, accel, gyro):
         if path is not None:
             files.taken(path)
-    return IntrinsicsInputs(log, options.gravity, options.planar)
+    return log, options.gravity, options.planar
 
 
 intrinsics = Stage(
@@ -166,12 +163,11 @@ class TuneOptions(LogOptions):
     )
 
 
-def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
+def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> tuple[Any, ...]:
     from calib.io.logs import read_log
     from calib.stages.actuator.kinematics import angle_from_marker
     from calib.stages.imu.read import Reading, sensor_noise, tune_log
     from calib.stages.imu.sampling import check_rate
-    from calib.stages.imu.tuning import TuneInputs
 
     how = Reading(options.rate == "up", options.reference)
     camera, plane = rig.camera, None
@@ -193,7 +189,7 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> TuneInputs:
     files.hashes |= rig.identities("imu")
     if any(log.reference == "camera" for log in logs):
         files.hashes |= rig.identities("geometry", "camera", "plane")
-    return TuneInputs(logs, *sensor_noise(rig, logs), how.tilted)
+    return logs, *sensor_noise(rig, logs), how.tilted
 
 
 def _tune_words(section: OrientationFilter) -> list[Block]:
@@ -242,8 +238,7 @@ class DriftOptions(LogOptions):
     peers: bool = option(True, "Run the filters of the extra peers as well.", flag="peers/--no-peers")
 
 
-def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
-    from calib.stages.imu.drift import DriftInputs
+def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> tuple[Any, ...]:
     from calib.stages.imu.levelling import Levelling
     from calib.stages.imu.mahony import Mahony
     from calib.stages.imu.read import drift_log
@@ -256,7 +251,7 @@ def _read_drift(files: Files, rig: Rig, options: DriftOptions) -> DriftInputs:
         if section.filter == "levelling" and section.tau_s and section.velocity_mps:
             gains = Levelling(section.tau_s, section.velocity_mps)
         tuned = Tuned(gains, section.rate_of_angle == "up vector")
-    return DriftInputs(logs, dict(files.hashes), tuned, options.peers, files.narrate)
+    return logs, dict(files.hashes), tuned, options.peers, files.narrate
 
 
 def _drift_document(result: Drift) -> dict[str, Any]:

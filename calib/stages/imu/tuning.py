@@ -1107,22 +1107,18 @@ class TuneLog:
     findings: tuple[Finding, ...] = ()
 
 
-@dataclass(frozen=True)
-class TuneInputs:
-    """Logs of one rate, densities of the sensor and where they are from, whether the up vector is used."""
+def solve_tune(
+    logs: Sequence[TuneLog], noise: Noise, densities_from: str, tilted: bool = False
+) -> OrientationFilter:
+    """Tune on logs of one rate, judge on what was held back, and assemble the section.
 
-    logs: Sequence[TuneLog]
-    noise: Noise
-    densities_from: str
-    tilted: bool = False
-
-
-def solve_tune(inputs: TuneInputs) -> OrientationFilter:
-    """Tune, judge on what was held back, and assemble the section."""
-
-    logs = inputs.logs
+    Parameters
+    ----------
+    noise : densities of the sensor; `densities_from` says where they are from.
+    tilted : whether the up vector is used.
+    """
     pieces = [piece for log in logs for piece in log.pieces]
-    result = tune(pieces, inputs.noise)
+    result = tune(pieces, noise)
     dt_s = float(np.median([log.sampling.period_s for log in logs]))
     chosen, mahony = result.recommended, result.mahony
     levelling = next((one.gains for one in result.candidates if isinstance(one.gains, Levelling)), None)
@@ -1148,7 +1144,7 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
         rate_hz=1.0 / dt_s,
         recommended=chosen.name,
         recommended_by=by,
-        rate_of_angle="up vector" if inputs.tilted else "-gz",
+        rate_of_angle="up vector" if tilted else "-gz",
         sigma=sigma,
         held_out=held_out,
         candidates={one.name: _candidate(one, dt_s) for one in result.candidates},
@@ -1157,11 +1153,11 @@ def solve_tune(inputs: TuneInputs) -> OrientationFilter:
             "walk_radps2_per_sqrt_Hz": result.noise.walk,
             "angle_rad_per_sqrt_Hz": result.noise.accel,
         },
-        densities_from=inputs.densities_from,
+        densities_from=densities_from,
         judged_s=result.judged_s,
         block_s=finite_or_none(result.block_s),
         logs=[_filter_log(log, result, k) for log, k in zip(logs, firsts, strict=False)],
-        **judged(Verdict.of([*findings, *_of_tuning(result, logs, inputs.tilted)])),
+        **judged(Verdict.of([*findings, *_of_tuning(result, logs, tilted)])),
     ).with_evidence((result, pieces))
 
 

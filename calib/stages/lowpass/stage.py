@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from calib.core.errors import BadInputError, UsageError
 from calib.core.options import LogOptions, option
@@ -71,28 +71,6 @@ class Options(LogOptions):
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """What a low-pass is made from.
-
-    Attributes
-    ----------
-    filter : as asked for.
-    workspace_m : where the marker can be.
-    positions : of the log to judge the filter on.
-    suggest : of the log to choose the filter by, among `orders` and `families` (all where empty).
-    wanted : jitter that the chosen filter may leave, in the positions' unit; None for that of `filter`.
-    """
-
-    filter: Filter
-    workspace_m: Sequence[float]
-    positions: Positions | None = None
-    suggest: Positions | None = None
-    wanted: float | None = None
-    orders: tuple[int, ...] = ()
-    families: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Evidence:
     """What a low-pass is drawn from."""
 
@@ -152,7 +130,7 @@ def positions_from_log(
     return Positions(log.source, unit, names, own, ticks, on_ticks(signals.t_s, pixels, rate_hz), spectra)
 
 
-def _read(files: Files, rig: Rig, options: Options) -> Inputs:
+def _read(files: Files, rig: Rig, options: Options) -> tuple[Any, ...]:
     from calib.io.logs import read_log
     from calib.stages.lowpass.filters import Design, design_lowpass
 
@@ -192,7 +170,7 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
         asked = f"{1e3 * wanted:g}mm" if unit == "m" else f"{wanted:g}px"
         has = "millimetres" if suggest.unit == "m" else "pixels, without a plane in the rig's file"
         raise UsageError(f"--jitter: {asked!r} does not fit positions in {has}")
-    return Inputs(
+    return (
         made,
         rig.workspace_m,
         shown,
@@ -203,8 +181,24 @@ def _read(files: Files, rig: Rig, options: Options) -> Inputs:
     )
 
 
-def solve(inputs: Inputs) -> LowPass:
+def solve(
+    made: Filter,
+    workspace_m: Sequence[float],
+    positions: Positions | None = None,
+    suggest: Positions | None = None,
+    wanted: float | None = None,
+    orders: tuple[int, ...] = (),
+    families: tuple[str, ...] = (),
+) -> LowPass:
     """Design or choose the filter, judge it, and assemble the section.
+
+    Parameters
+    ----------
+    made : as asked for.
+    workspace_m : where the marker can be.
+    positions : of the log to judge the filter on.
+    suggest : of the log to choose the filter by, among `orders` and `families` (all where empty).
+    wanted : jitter that the chosen filter may leave, in the positions' unit; None for that of `made`.
 
     Raises `BadInputError` where no filter leaves so little jitter, or none is needed.
     """
@@ -214,15 +208,15 @@ def solve(inputs: Inputs) -> LowPass:
     from calib.stages.lowpass import filters
     from calib.stages.lowpass.section import LowPass, LowPassSection
 
-    made, positions, wanted, choice = inputs.filter, inputs.positions, inputs.wanted, None
-    if inputs.suggest is not None:
-        spectra = inputs.suggest.spectra
+    choice = None
+    if suggest is not None:
+        spectra = suggest.spectra
         if wanted is None:
             wanted = max(filters.jitter_after(of, made.sections) for of in spectra)
         try:
-            choice = filters.suggest(spectra, wanted, inputs.orders, inputs.families, inputs.suggest.unit)
+            choice = filters.suggest(spectra, wanted, orders, families, suggest.unit)
         except BadInputError as error:
-            raise BadInputError(f"{inputs.suggest.source}: {error}") from error
+            raise BadInputError(f"{suggest.source}: {error}") from error
         made = choice.best.filter
     design, sections, rate = made.design, made.sections, made.design.rate_hz
     rounded = filters.cutoff_hz(sections, rate)
@@ -233,7 +227,7 @@ def solve(inputs: Inputs) -> LowPass:
     )
     gains = filters.decibels(filters.frequency_response(sections, np.array(f), rate))
     band = np.linspace(0.0, design.cutoff_hz, 201)
-    largest = max(abs(value) for value in inputs.workspace_m)
+    largest = max(abs(value) for value in workspace_m)
     float_mm = 1e3 * largest * filters.rest_error_binary32(made)
     log = None if positions is None else _log_section(made, positions)
     findings = [*_of_rounding(made, rounded, float_mm)]
