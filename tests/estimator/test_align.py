@@ -214,6 +214,17 @@ def test_sigma_holds_what_is_another_in_one_log(
     assert abs(found.rest_angle_rad - true_rest) < 3.0 * found.rest_angle_sigma
 
 
+def test_columns_that_are_swapped_are_judged() -> None:
+    """The fit then puts the marker where no picture shows it, and that has no derivative."""
+    trial = known(SimulatedRig())
+    logs = [
+        align_log(twin_log(trial.rig, name, options, 11 + k))
+        for k, (name, options) in enumerate(MOTIONS[1:3])
+    ]
+    logs = [replace(log, pixels=log.pixels[:, ::-1].copy()) for log in logs]
+    assert judge(align(logs, prior_settings(trial.view))).word == "unidentifiable"
+
+
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:
     nominal = SimulatedRig()
     tracker = replace(nominal.tracker, outliers=0.03, dropouts=0.05, blackouts_s=((1.0, 0.4),))

@@ -1143,7 +1143,8 @@ def _apart(problem: Problem, fit: Fit, logs: int) -> list[Apart]:
                 continue
             to_c = np.zeros(c.size)
             for rows, pull, weight in _terms(problem, fit, stretch, c, name):
-                change = rows.by[:, :, at]
+                # A place that no picture shows has no derivative.
+                change = np.where(weight > 0.0, rows.by[:, :, at], 0.0)
                 score += float((pull * change).sum())
                 alone += float((weight * change**2).sum())
                 gathered(rows.span, rows.basis, rows.by, weight * change, to_c, right)
