@@ -237,7 +237,7 @@ class Passed:
     not_finite : cells that said nan or inf; in Parquet nan is a blank.
     beyond : cells that hold more than any sensor gives. first : the first of them, in words.
     clipped : readings at the end of their sensor's range. end : the first of them, in words.
-    outside : pictures that put the marker outside of them.
+    outside : pictures that put the marker outside of them or at (0, 0).
     truncated : whether the last line was cut short and left out.
     wraps : how often the counter that is the time began again.
     sorted : rows that stood below a later one, and were put where they belong.
@@ -279,7 +279,7 @@ class Passed:
         kinds = (
             (self.not_finite, f"{self.not_finite} cells say nan or inf {blank}"),
             (self.beyond, f"{self.beyond} cells hold more than any sensor gives ({self.first}) {blank}"),
-            (self.outside, f"{self.outside} pictures put the marker outside the picture {blank}"),
+            (self.outside, f"{self.outside} pictures put the marker outside of them or at (0, 0) {blank}"),
             (
                 self.clipped,
                 f"{self.clipped} readings are at the end of a sensor's range ({self.end}) {blank}",

@@ -187,14 +187,14 @@ _MOST_OUTSIDE, _SENTINELS = 0.05, 2
 
 
 def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
-    """The log with blanks for markers outside of pictures of this width and height.
+    """The log with blanks for markers outside of pictures of this width and height, and for those at (0, 0).
 
     Raises `BadInputError` where there are many, unless they hold the same few numbers, as those of a tracker
-    that says so that it has lost the marker.
+    that says so that it has lost the marker. No marker has its middle on the pixel in the corner.
     """
     rows = log.sampled(*_MARKER)
     at = np.stack([log.columns[name][rows] for name in _MARKER], axis=1) if len(rows) else np.zeros((0, 2))
-    outside = ~in_picture(at, size_px)
+    outside = ~in_picture(at, size_px) | ~at.any(axis=1)
     if not outside.any():
         return log
     if outside.mean() > _MOST_OUTSIDE and len(np.unique(at[outside], axis=0)) > _SENTINELS:
