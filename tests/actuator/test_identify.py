@@ -49,8 +49,7 @@ from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import Orifice, RateLimit
 from calib.stages.actuator.read import let_go, read_track, start_in_motion
-from calib.stages.actuator.section import Known, KnownActuator, KnownPump
-from calib.stages.actuator.validate import IMPROVED, ORIGINAL, begun_track, compare, models_of
+from calib.stages.actuator.validate import IMPROVED, ORIGINAL, compare
 from calib.twin.rig import SimulatedRig
 
 TRUTH = {
@@ -872,28 +871,3 @@ def test_one_wrong_picture_does_not_decide() -> None:
     assert wrong.replaced == clean.replaced + 1
     assert wrong.errors[ORIGINAL]["q1"].norm == pytest.approx(clean.errors[ORIGINAL]["q1"].norm, rel=0.02)
     assert wrong.improvement_percent("q1") is None
-
-
-def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
-    rig, truth = varied(2)
-    keys = ("stiffness_scale", "damping_scale_pumps_connected", "bending_N_per_rad2", "lambda1_per_s")
-    keys += "lambda2_N_per_m", "damping_scale_free_swing", "rest_length_m"
-    actuator = {key: truth[key] for key in keys}
-    pump = {key: truth[key] for key in ("lag_s", "falling_N_per_s")}
-    pump["strength"] = [truth["strength1"], truth["strength2"]]
-    path = tmp_path / "rig.yaml"
-    stated = Known(actuator=KnownActuator(**actuator, lambda3=-1.0), pump=KnownPump(**pump))
-    known = rig_file(path, known=stated)
-    log = log_file(tmp_path / "log.csv", rig, "prbs", 1, 6.0)
-    files = Files((log,), path)
-    track, start = begun_track(files, log, known, PoseOptions(truth=True))
-    found = compare(track, models_of(known), start)
-    assert found.how == "truth" and found.hoses
-    assert found.errors[IMPROVED]["q1"].rms < 1e-5 and found.errors[IMPROVED]["phi"].rms < 1e-3
-    assert found.improvement_percent("q1") > 99.0
-    track, start = begun_track(Files((log,), path), log, known, PoseOptions())
-    seen = compare(track, models_of(known), start)
-    assert seen.how == "pictures"
-    # The marker's place comes in whole pixels of a third of a millimetre and more.
-    assert 1e-4 < seen.errors[IMPROVED]["q1"].rms < 1e-3
-    assert seen.errors[IMPROVED]["q1"].fit_percent > seen.errors[ORIGINAL]["q1"].fit_percent

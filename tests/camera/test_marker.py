@@ -113,12 +113,12 @@ def test_another_disc_is_told_and_not_followed() -> None:
     scene = Scene(other="disc", noise=2.0)
     start = scene.centre_px(0.0)
     tracker, alone = Tracker(parse_colour("orange"), (start[0], start[1])), Tracker(parse_colour("orange"))
-    for t_s, frame in scene.frames(40):
+    for t_s, frame in scene.frames(20):
         one = tracker.follow(frame)
         assert one is not None and np.hypot(*(one.centre_px - scene.centre_px(t_s))) < 0.2
         # Without a person's word neither of two is taken.
         assert alone.follow(frame) is None
-    assert tracker.doubled == alone.doubled == 40
+    assert tracker.doubled == alone.doubled == 20
 
 
 def test_what_covers_the_marker_makes_it_lost_and_not_wrong() -> None:

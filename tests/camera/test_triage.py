@@ -136,8 +136,15 @@ def _turned(view: View, how: str) -> View:
     return replace(view, pixels=pixels[order])
 
 
-@pytest.mark.parametrize("how", ["turned by half a turn", "mirrored left to right"])
-@pytest.mark.parametrize(("count", "bad"), [(13, 4), (13, 1), (30, 14)])
+@pytest.mark.parametrize(
+    ("how", "count", "bad"),
+    [
+        ("turned by half a turn", 13, 4),
+        ("mirrored left to right", 13, 4),
+        ("mirrored left to right", 13, 1),
+        ("turned by half a turn", 30, 14),
+    ],
+)
 def test_turned_pictures_are_named(how: str, count: int, bad: int) -> None:
     """The centre is off by 12 px: all are named and no other, and what is left is the camera without them."""
     rng = np.random.default_rng(5)
