@@ -22,8 +22,10 @@ from reference_pages import pages as generated_pages
 from reference_pages import verbs
 from typer.main import get_command
 
+import calib
 from calib.cli.app import command_line
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
+from calib.cli.simulate import simulate
 from calib.core.bounded_yaml import load
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
@@ -92,10 +94,8 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     shutil.copytree(ROOT / "images", "images")
     Path("logs").mkdir()
     for scenario, seconds in (("static", 10), ("swing", 6), ("ellipse", 6)):
-        words = ["simulate", scenario, "-o", f"logs/{scenario}.csv", "--duration", f"{seconds}s"]
-        subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
-    words = ["intrinsics", "images", "--rig", "old.yaml"]
-    subprocess.run([sys.executable, "-m", "calib", *words], check=True, capture_output=True)
+        simulate(scenario, Path(f"logs/{scenario}.csv"), duration=f"{seconds}s")
+    calib.Rig().with_sections({"camera": calib.intrinsics("images")}).save(Path("old.yaml"))
     parts = [block for _, block in blocks((MANUAL / "tour.md").read_text(encoding="utf-8"), "python")]
     names: dict[str, Any] = {}
     exec(compile("".join(parts), "tour.md", "exec"), names)

@@ -487,7 +487,7 @@ def test_a_page_of_any_summary(run: tuple[Path, dict[str, Any]], tmp_path: Path)
     place.write_bytes(rig.read_bytes())
     (tmp_path / ".calib").mkdir()
     dice = random.Random(1)
-    for _ in range(60):
+    for _ in range(30):
         other = copy.deepcopy(told)
         path = dice.choice(_paths(other)[1:])
         parent = other
