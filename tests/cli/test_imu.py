@@ -356,9 +356,12 @@ def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path) -
     t = 0.01 * np.arange(3000)
     t[2000:] += 3600.0
     rows = np.sort(np.concatenate([np.delete(np.arange(3000), [1000]), np.arange(100, 700, 100)]))
-    log = _write(tmp_path / "log.csv", _at_rest()[rows], t[rows])
+    values = _at_rest()[rows]
+    values[:, 0] = 0.002
+    log = _write(tmp_path / "log.csv", values, t[rows])
     ended = calib("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
     assert ended.code == 0
+    assert "(remark) log.csv: gx_radps never changes, it is stuck at 0.002; left out" in ended.out
     assert "1 samples missing in 1 gap(s), the longest 20 ms after 9.99 s" in ended.out
     assert "split at a gap of 3600 s after 19.99 s" in ended.out
     assert "6 rows (0.20%) repeat the one before; dropped" in ended.out

@@ -93,9 +93,7 @@ def drift_log(log: Log) -> Readings:
     signals = _readings(log, *IN_PLANE)
     signals.refuse_stuck(*IN_PLANE)
     left_out = tuple(
-        Finding(
-            "remark", f"{log.source}: {name} never changes, it is stuck at {signals[name][0]:.6g}; left out"
-        )
+        Finding("remark", f"{name} never changes, it is stuck at {signals[name][0]:.6g}; left out")
         for name in signals.stuck
     )
     return _of(log, signals.without(*signals.stuck), *left_out)
