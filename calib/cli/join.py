@@ -34,7 +34,8 @@ def join(
 
     Finds how the clocks stand to each other by the motion that both saw, whatever the offset. With camera and
     plane in the rig's file the marker's way is an angle, and one swing suffices; without, move unevenly.
-    Begin both recordings before the first motion.
+    Begin both recordings before the first motion. With --same-clock or --offset any two logs are joined, as
+    those of a phone that writes a file for each of its sensors.
     """
     from calib.core.rig import Rig
     from calib.io.logs import LOG, beside, read_log, write_log
@@ -62,7 +63,7 @@ def join(
         lines.append("calib align finds the rest of the offset")
     answer(as_json, "join", {"join": told}, *lines)
     if outside:
-        narrate(f"pictures outside the IMU's time, which are left out: {outside}")
+        narrate(f"rows of {shown(camera)} outside the time of {shown(board)}, which are left out: {outside}")
     if clocks is not None and clocks.drift_s is not None and abs(clocks.drift_s) > DRIFT_S:
         narrate(
             f"the clocks drift by {1e3 * clocks.drift_s:.0f} ms between the halves; join shorter recordings"

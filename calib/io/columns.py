@@ -103,7 +103,7 @@ _SPELLED = {
 }  # fmt: skip
 _UNIT = {word: unit for unit, words in _SPELLED.items() for word in words.split()}
 
-_ACCEL = r"(?P<accel>a|ac|acc|accl|accel|accelerometer|acceleration|linearacceleration|specificforce)"
+_ACCEL = r"(?P<accel>a|ac|acc|accl|accel|accelerometer|(?:total|linear)?acceleration|specificforce)"
 _GYRO = r"(?P<gyro>g|gy|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate)"
 _AXIS = re.compile(rf"(?:{_ACCEL}|{_GYRO})(?:rss)?(?P<axis>[xyz])")
 _AXIS_FIRST = re.compile(r"(?P<axis>[xyz])(?:(?P<accel>accl?|accel)|gyro)")
@@ -512,7 +512,8 @@ def column_map(
     stated = dict(file.sources) if file else {}
     found: dict[str, list[tuple[str, str]]] = {}
     for name in names:
-        known = known_name(name)
+        # Phones write a file for each sensor: x of Gyroscope.csv.
+        known = known_name(f"{log.stem} {name}" if name in ("x", "y", "z") else name)
         if known is not None:
             found.setdefault(known[0], []).append((name, known[1]))
     pair = ("u_px", "v_px")

@@ -317,7 +317,7 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     (tmp_path / "board.csv").write_text("t_s,gz_radps,pwm1,pwm2\n0,0.1,0,0\n0.01,0.2,,\n0.02,0.3,9,9\n")
     words = ("join", "track.csv", "board.csv", "--same-clock", "-o")
     ended = calib(*words, "log.csv", cwd=tmp_path)
-    assert ended.code == 0 and "pictures outside the IMU's time, which are left out: 1" in ended.err
+    assert ended.code == 0 and "track.csv outside the time of board.csv, which are left out: 1" in ended.err
     assert (tmp_path / "log.csv").read_text() == (
         "t_s,u_px,v_px,gz_radps,pwm1,pwm2\n0.000000,,,0.1,0,0\n0.005000,1,2,,,\n"
         "0.010000,,,0.2,,\n0.020000,3,4,,,\n0.020000,,,0.3,9,9\n"
@@ -333,6 +333,20 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     ended = calib("join", "track.csv", "board.csv", "-o", "other.csv", cwd=tmp_path)
     assert ended.code == 3 and "do not tell one offset" in ended.err
     assert not (tmp_path / "other.csv").exists()
+    text = "time,seconds_elapsed,z,y,x\n" + "".join(
+        f"{10**18},{0.01 * k:.2f},0,9.8,{k % 3}\n" for k in range(30)
+    )
+    (tmp_path / "TotalAcceleration.csv").write_text(text)
+    (tmp_path / "Gyroscope.csv").write_text(text.replace("9.8", "0.1"))
+    (tmp_path / "columns.yaml").write_text("units: {gyro: rad/s}\n")
+    phone = ("join", "TotalAcceleration.csv", "Gyroscope.csv", "--same-clock", "-o", "phone.csv")
+    ended = calib(*phone, cwd=tmp_path)
+    assert ended.code == 0, ended.err
+    assert len(read_log(tmp_path / "phone.csv").sampled("ay_mps2")) == 30
+    assert len(read_log(tmp_path / "phone.csv").sampled("gx_radps", "gy_radps", "gz_radps")) == 30
+    ended = calib("join", "Gyroscope.csv", "phone.csv", "--same-clock", "-o", "again.csv", cwd=tmp_path)
+    assert ended.code == 3 and "Gyroscope.csv: has no column that phone.csv has not" in ended.err
+    (tmp_path / "columns.yaml").unlink()
     rig_file(tmp_path / "rig.yaml")
     (tmp_path / "track.csv").write_text("t_s,u_px,v_px\n0.005,400,2\n0.02,401,4\n0.03,402,4\n")
     ended = calib(*words, "outside.csv", cwd=tmp_path)

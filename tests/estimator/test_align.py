@@ -757,8 +757,8 @@ def test_logs_of_one_clock_are_merged_as_they_are() -> None:
     assert found is None and outside <= 1
     assert set(camera.t_s[outside:]) <= set(log.t_s)
     with pytest.raises(BadInputError, match=r"board\.csv: has no pictures"):
-        joined(board, board, Rig(), "rig.yaml", 0.0)
-    with pytest.raises(BadInputError, match="none of its pictures is within the time"):
+        joined(board, replace(board, columns={"gz_radps": board.columns["gz_radps"]}), Rig(), "rig.yaml")
+    with pytest.raises(BadInputError, match="none of its rows is within the time"):
         joined(replace(camera, t_s=camera.t_s + 1e6), board, Rig(), "rig.yaml", 0.0)
 
 

@@ -11,6 +11,7 @@ from calib.io.logs import Log
 from calib.solve.delay import Clocks, clocks
 from calib.stages.actuator.kinematics import angle_from_marker
 
+_MARKER = ("u_px", "v_px")
 _LONGEST_S = 6.0 * 3600.0
 DRIFT_S = 0.004
 """Between the halves of a recording, beyond which it is told."""
@@ -36,24 +37,29 @@ def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, 
 def joined(
     camera: Log, board: Log, rig: Rig, rig_name: str, offset_s: float | None = None
 ) -> tuple[Log, Clocks | None, int]:
-    """The board's log with the camera's marker in it, how the clocks stand, and pictures that are left out.
+    """The board's log with the camera's marker in it, how the clocks stand, and rows that are left out.
 
     Parameters
     ----------
     rig : whose camera and plane, where it has them, make an angle of the marker.
-    offset_s : to be added to the pictures' times, where it is known.
+    offset_s : to be added to the pictures' times, where it is known; then any two logs can be joined, the
+        first with all columns that the board's has not.
 
     Raises `BadInputError` for logs without pictures or gyroscope, and for motion that tells no offset.
     """
-    for log, names, what in ((camera, ("u_px", "v_px"), "pictures"), (board, ("gz_radps",), "gyroscope")):
-        if not len(log.sampled(*names)):
-            raise BadInputError(f"{log.source}: has no {what}, expected {' and '.join(names)}")
+    for log in (camera, board):
         if float(np.ptp(log.t_s)) > _LONGEST_S:
             raise BadInputError(
                 f"{log.source}: lasts {np.ptp(log.t_s):.0f} s, expected {_LONGEST_S:.0f} s at most"
             )
-    found = None
+    found, own = None, [name for name in camera.columns if name in _MARKER or name not in board.columns]
+    if not own:
+        raise BadInputError(f"{camera.source}: has no column that {board.source} has not")
     if offset_s is None:
+        for log, names, what in ((camera, _MARKER, "pictures"), (board, ("gz_radps",), "gyroscope")):
+            if not len(log.sampled(*names)):
+                raise BadInputError(f"{log.source}: has no {what}, expected {' and '.join(names)}")
+        own = list(_MARKER)
         gyro = board.signals("gz_radps")
         camera_s, way, scaled = _way(camera, rig, rig_name)
         found = clocks(camera_s, way, gyro.t_s, gyro["gz_radps"], scaled)
@@ -73,13 +79,12 @@ def joined(
                 "--offset, where both have one clock --same-clock"
             )
         offset_s = found.offset_s
-    rows = camera.sampled("u_px", "v_px")
+    rows = np.flatnonzero(np.logical_or.reduce([np.isfinite(camera.columns[name]) for name in own]))
     moved = camera.t_s[rows] + offset_s
     inside = (moved >= board.t_s[0]) & (moved <= board.t_s[-1])
     if not inside.any():
-        raise BadInputError(f"{camera.source}: none of its pictures is within the time of {board.source}")
+        raise BadInputError(f"{camera.source}: none of its rows is within the time of {board.source}")
     rows, moved = rows[inside], moved[inside]
-    own = ("u_px", "v_px")
     carried = [name for name in board.columns if name not in own]
     t = np.concatenate([moved, board.t_s])
     order = np.argsort(t, kind="stable")
