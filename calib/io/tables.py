@@ -76,7 +76,7 @@ def _number(text: _Text, word: str, column: str, line: int) -> float:
 _BLANK = ("", "NA", "N/A", "null", "NULL", "None")
 """Cells of a sensor that was not sampled, as R, pandas, JavaScript and Python write them."""
 _DATE = "a date such as 2024-05-01T12:00:00.25"
-_TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
+_TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,:]\d+)?)")
 
 
 def _date_s(word: str) -> float | None:
@@ -85,7 +85,7 @@ def _date_s(word: str) -> float | None:
     """
     if of_day := _TIME_OF_DAY.fullmatch(word):
         hours, minutes, seconds = of_day.groups()
-        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(re.sub("[,:]", ".", seconds))
     try:
         date = datetime.fromisoformat(word)
     except ValueError:
@@ -212,7 +212,10 @@ def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
             continue
         cells = _split(where, words, text.separator)
         if len(cells) != count:
-            raise BadInputError(f"{where}: has {len(cells)} cells, expected {count} as in the header")
+            raise BadInputError(
+                f"{where}: has {len(cells)} cells, expected {count} as in the header; take out a line that "
+                "came damaged"
+            )
         for k, (name, slot) in enumerate(text.slots.items()):
             values[row, k] = _number(text, cells[slot], name, line)
     values, lines = values[~said], lines[~said]
@@ -286,8 +289,10 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
         try:
             raw.decode("utf-8")
         except UnicodeDecodeError as error:
-            at = error.start
-            raise BadInputError(f"{where}: is not UTF-8 text (byte {at}), expected a header") from error
+            raise BadInputError(
+                f"{where}: is not UTF-8 text (byte {error.start}), expected a header; save a spreadsheet as "
+                "CSV, unpack what is packed"
+            ) from error
     if "\0" in head:
         raise BadInputError(f"{where}: has a zero byte, expected a text file")
     separator = (file and file.separator) or _mark(head)

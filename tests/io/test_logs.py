@@ -442,9 +442,10 @@ def test_times_may_be_dates(write, form: str, mark: str, zone: str) -> None:
         read_log(write(f"t_s{mark}u_px\n1{mark}1\n{dates[0]}{mark}1\n"))
 
 
-def test_times_of_day_run_on_past_midnight(write, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("mark", [".", ":"])
+def test_times_of_day_run_on_past_midnight(write, monkeypatch: pytest.MonkeyPatch, mark: str) -> None:
     start = datetime(2024, 2, 29, 23, 59, 58, 250_000)
-    times = [(start + timedelta(milliseconds=20 * k)).strftime("%H:%M:%S.%f")[:-3] for k in range(500)]
+    times = [(start + timedelta(milliseconds=20 * k)).strftime(f"%H:%M:%S{mark}%f")[:-3] for k in range(500)]
     path = write("time,u_px\n" + "".join(f"{time},{k}\n" for k, time in enumerate(times)))
     for size in (1 << 20, 1000):
         monkeypatch.setattr(tables, "_BLOCK_BYTES", size)
