@@ -13,7 +13,7 @@ from calib.core.command import note_inputs
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import as_text, one_line, read_bytes, read_yaml_mapping, sha256, shown
 from calib.core.units import parse_corners, parse_square_m
-from calib.core.writing import Kind, check_writable, write_atomically
+from calib.core.writing import check_writable, write_atomically
 
 # ----------------------------------------------------------------------
 # `calib board`: a checkerboard or ChArUco board to print, at exact scale.
@@ -97,7 +97,10 @@ def export_camera(
     as_json: JsonOption = False,
 ) -> None:
     """Write the camera as ROS camera_info, OpenCV FileStorage or Kalibr camchain, the IMU as imu.yaml."""
-    kind = _kind_of(to)
+    from calib.stages.camera.formats import FILES
+    from calib.stages.imu.formats import IMU_YAML
+
+    kind = FILES.get(to, IMU_YAML)
     if output is not None:
         note_inputs([rig])
         check_writable(output, kind)
@@ -112,13 +115,6 @@ def export_camera(
         document("export", {"format": to, "verdict": verdict, "text": text})
     elif output is None:
         emit(text.rstrip("\n") + "\n")
-
-
-def _kind_of(to: str) -> Kind:
-    from calib.stages.camera.formats import FILES
-    from calib.stages.imu.formats import IMU_YAML
-
-    return FILES.get(to, IMU_YAML)
 
 
 def _camera_text(to: str, rig: Path, name: str) -> tuple[str, str]:

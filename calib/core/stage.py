@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from calib.core.plot import Figure
     from calib.core.result import Result
     from calib.core.rig import Rig
-    from calib.core.writing import Kind
 
 
 class ProgressCall(Protocol):
@@ -170,7 +169,7 @@ class Output:
     write : writes an outcome to `Files.output`; the files written. None where the stage itself writes, as one
         does that answers for more than fits into memory.
     folder : whether it is a folder, whose files --json names.
-    kind : gives the kind of the file.
+    kind : module and name of the kind of the file.
     """
 
     words: str
@@ -179,7 +178,7 @@ class Output:
     metavar: str = ""
     default: Path | None = None
     folder: bool = False
-    kind: Callable[[], Kind] | None = None
+    kind: tuple[str, str] | None = None
 
 
 def _parts(outcome: Any) -> tuple[Result | None, ...]:

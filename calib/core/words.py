@@ -103,12 +103,12 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
     out: list[tuple[str, str]] = []
     for key, field, value in _labelled(section):
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-        wanted, bars = extra.get("fact"), _sigma(sigmas, key)
+        wanted, bars = extra.get("fact"), _named(sigmas, key)
         unit, scale, places = _shown(key, field)
         if isinstance(wanted, list):
             for item in wanted:
                 name = _AXES[item] if isinstance(item, int) else as_words(str(item)).replace("max", "at most")
-                one = value[item] if isinstance(item, int) else _item(value, str(item))
+                one = value[item] if isinstance(item, int) else _named(value, str(item))
                 own = unit or unit_of(str(item))
                 bar = bars[item] if isinstance(bars, list) and isinstance(item, int) else None
                 out.append((f"{field.title}, {name}", f"{_fact(one, bar, scale, places)} {own}".strip()))
@@ -125,10 +125,6 @@ def _fact(value: Any, bar: Any, scale: float, places: int | None) -> str:
     if isinstance(value, float) and math.isfinite(value) and bar is None and places is None:
         return short(scale * value)
     return _vector([value], [bar], scale, places)[0]
-
-
-def _item(value: Any, name: str) -> Any:
-    return value.get(name) if isinstance(value, Mapping) else getattr(value, name, None)
 
 
 def of_verdict(verdict: Verdict) -> list[Line]:
@@ -170,7 +166,7 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
     later: list[Block] = []
     sigmas, bounds = getattr(section, "sigma", None), getattr(section, "below", None)
     for key, field, value in _labelled(section):
-        label, bars = f"{prefix}{field.title}", _sigma(sigmas, key)
+        label, bars = f"{prefix}{field.title}", _named(sigmas, key)
         unit, scale, places = _shown(key, field)
         parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
         first = next(iter(parts), None)
@@ -192,7 +188,7 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
         elif isinstance(value, list) and all(isinstance(one, int) for one in value):
             scalars.append((_with_unit(label, unit), " x ".join(str(one) for one in value), ""))
         elif isinstance(value, list) and len(value) in (2, 3) and not isinstance(first, str | list):
-            cells = _vector(value, bars, scale, places, _sigma(bounds, key))
+            cells = _vector(value, bars, scale, places, _named(bounds, key))
             vectors.append((_with_unit(label, unit), *cells))
         elif isinstance(value, list):
             scalars.append((label, ", ".join(str(one) for one in value), ""))
@@ -211,7 +207,7 @@ def _gathered(section: BaseModel, prefix: str) -> tuple[Rows, Rows, list[Block]]
 def _unlabelled(part: BaseModel, sigmas: Any, prefix: str) -> Iterator[tuple[str, str, str]]:
     """Numbers of a part whose keys are their own labels, as k1: those that are not zero or were estimated."""
     for key, field in type(part).model_fields.items():
-        value, sigma = getattr(part, key), _sigma(sigmas, key)
+        value, sigma = getattr(part, key), _named(sigmas, key)
         if field.title is None and isinstance(value, float) and (value != 0.0 or sigma is not None):
             bar = number(sigma, sigma) if isinstance(sigma, float) else ""
             yield (f"{prefix}{key}", number(value, sigma if isinstance(sigma, float) else None), bar)
@@ -255,10 +251,9 @@ def _with_unit(label: str, unit: str) -> str:
     return f"{label}, {unit}" if unit else label
 
 
-def _sigma(sigmas: Any, key: str) -> Any:
-    if isinstance(sigmas, Mapping):
-        return sigmas.get(key)
-    return getattr(sigmas, key, None)
+def _named(values: Any, key: str) -> Any:
+    """A value of a mapping or of a section by its name, None where there is none."""
+    return values.get(key) if isinstance(values, Mapping) else getattr(values, key, None)
 
 
 def _vector(
@@ -328,7 +323,7 @@ def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
             if isinstance(value, list | bool | str):
                 cells.append(_cell(value, scale, places))
             else:
-                cells.append(*_vector([value], [_sigma(sigmas, key)], scale, places))
+                cells.append(*_vector([value], [_named(sigmas, key)], scale, places))
         rows.append(tuple(cells))
     return Table(((label, *head) if named is parts else tuple(head)), tuple(rows), label)
 

@@ -279,10 +279,6 @@ def _may_fork(items: int) -> bool:
     )
 
 
-def _sign() -> None:
-    _leaving.add(threading.get_native_id())
-
-
 def _have_left() -> bool:
     """Wait until threads that Python has done with are gone for the system as well.
 
@@ -346,7 +342,7 @@ class Workers(Generic[Shared]):
         return self._by_processes(work, list(items)) if self._forks else self._by_threads(work, items)
 
     def _by_threads(self, work: Callable[[Shared, S], T], items: Iterable[S]) -> Iterator[T]:
-        pool = ThreadPoolExecutor(self._count, initializer=_sign)
+        pool = ThreadPoolExecutor(self._count, initializer=lambda: _leaving.add(threading.get_native_id()))
         try:
             futures = [pool.submit(work, self._shared, item) for item in items]
             futures.reverse()

@@ -158,10 +158,6 @@ def _lowpass(folder: Folder, job: Job) -> Job:
     return job
 
 
-def _nothing(_: Folder, job: Job) -> Job:
-    return job
-
-
 def _control(folder: Folder, job: Job) -> Job:
     # A rig.yaml may tell of the actuator; without one nothing but these logs does.
     if folder.rig is None and not _logs(folder, "motion", *_CAMERA, *_PUMP):
@@ -205,7 +201,7 @@ def _step(verb: str, plan: Plan, needs: tuple[str, ...] = (), **beyond: Any) -> 
 STEPS: tuple[Step, ...] = (
     _step("intrinsics", _intrinsics, flashed=True, seconds=5.0),
     _step("extrinsics", _extrinsics, flashed=True, seconds=3.0),
-    _step("distortion", _nothing),
+    _step("distortion", lambda folder, job: job),
     _step("imu static", _resting, flashed=True, seconds=4.0),
     _step("imu intrinsics", _poses),
     _step("imu tune", _moving, flashed=True, seconds=4.0),
@@ -218,7 +214,7 @@ STEPS: tuple[Step, ...] = (
     _step("replay", _replay, _OPTICS, each_log=True, output="states.csv", seconds=2.0),
     _step("control tune", _control, name="control", flashed=True, seconds=3.0),
     _step("validate", _driven, _OPTICS, seconds=8.0),
-    _step("firmware", _nothing, output="firmware"),
+    _step("firmware", lambda folder, job: job, output="firmware"),
 )
 """All steps, each after those whose sections it reads."""
 

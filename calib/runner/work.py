@@ -7,6 +7,7 @@ document and words, its messages, the charts of its figures and what it wrote be
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import traceback
@@ -52,7 +53,8 @@ def _carried_out(
         if output.folder:
             check_folder(files.output)
         else:
-            check_writable(files.output, None if output.kind is None else output.kind())
+            module, kind = output.kind or ("", "")
+            check_writable(files.output, getattr(importlib.import_module(module), kind) if kind else None)
     if figures is not None:
         check_figures(figures)
     # A name that a person has mistyped is no empty rig for a stage that only reads it.

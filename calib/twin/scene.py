@@ -221,11 +221,6 @@ def _distance_rectangle(x: FloatArray, y: FloatArray, half_x: float, half_y: flo
     return np.maximum(np.abs(x) - half_x, np.abs(y) - half_y)
 
 
-def _distance_disc(x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
-    """Signed distance to a circle, negative inside."""
-    return np.sqrt(x * x + y * y) - radius
-
-
 def clutter(size_px: tuple[int, int], seed: int) -> FloatArray:
     """Reflectance of a desk strewn with papers, discs, frames and cables, without any checkerboard.
 
@@ -255,7 +250,7 @@ def clutter(size_px: tuple[int, int], seed: int) -> FloatArray:
         size = scale * (0.03 + 0.12 * draw[3])
         kind = int(5 * draw[4])
         if kind == 0:  # a disc, such as a mug from above, with a rim
-            distance = _distance_disc(x, y, 0.6 * size)
+            distance = np.sqrt(x * x + y * y) - 0.6 * size
             if draw[9] > 0.5:
                 distance = np.abs(distance) - 0.12 * size
         elif kind == 1:  # a cable: a long, slightly bent line

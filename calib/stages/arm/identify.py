@@ -275,10 +275,6 @@ _Pair = tuple[FloatArray, ...]
 _Error = Callable[[Sequence[_Pair], _Pair], float]
 
 
-def _thinned(values: FloatArray, step_s: float) -> FloatArray:
-    return np.asarray(blocks(values, round(step_s / STEP_S)).mean(axis=1))
-
-
 def _arx_rows(u: FloatArray, y: FloatArray, order: int) -> FloatArray:
     k = np.arange(order, len(y))
     past = [y[k - i] for i in range(1, order + 1)] + [u[k - i] for i in range(1, order + 1)]
@@ -321,10 +317,10 @@ def _lag_error(train: Sequence[_Pair], test: _Pair) -> float:
 
 
 def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Errors:
-    out = {}
+    out, size = {}, round(step_s / STEP_S)
     for name, one in QUANTITIES.items():
         pairs = [
-            tuple(_thinned(getattr(of, column), step_s) for column in (one.source, one.target))
+            tuple(blocks(getattr(of, column), size).mean(axis=1) for column in (one.source, one.target))
             for of in (*train, trial)
             if len(getattr(of, one.source)) and len(getattr(of, one.target))
         ]

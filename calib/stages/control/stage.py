@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
     from calib.core.rig import Rig
     from calib.core.stage import Progress
-    from calib.core.writing import Kind
     from calib.stages.control.laws import Model
     from calib.stages.control.references import Reference
     from calib.stages.control.section import (
@@ -345,12 +344,6 @@ def _check_words(checked: Checked) -> list[Block]:
     ]
 
 
-def _reference_kind() -> Kind:
-    from calib.stages.control.read import REFERENCE
-
-    return REFERENCE
-
-
 def _write_slower(files: Files, checked: Checked) -> list[Path]:
     from calib.stages.control.read import write_reference
 
@@ -379,7 +372,7 @@ check = Stage(
         _write_slower,
         flags=("--slow",),
         metavar="CSV",
-        kind=_reference_kind,
+        kind=("calib.stages.control.read", "REFERENCE"),
     ),
     document=_check_document,
     words=_check_words,

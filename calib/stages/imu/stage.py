@@ -12,7 +12,7 @@ from calib.core.options import LogOptions, option
 from calib.core.stage import Files, Output, Stage, later
 from calib.core.units import GRAVITY_MPS2
 from calib.core.words import Block, Line, described, listed
-from calib.core.writing import Kind, write_atomically
+from calib.core.writing import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,12 +42,6 @@ def _read_static(files: Files, rig: Rig, options: LogOptions) -> tuple[list[Read
 
     del rig
     return (_readings(files, options, rest_log),)
-
-
-def _imu_yaml() -> Kind:
-    from calib.stages.imu.formats import IMU_YAML
-
-    return IMU_YAML
 
 
 def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
@@ -80,7 +74,12 @@ static = Stage(
     metavar="LOG...",
     leaves_out=True,
     writes=("imu",),
-    output=Output("Kalibr's imu.yaml to write as well.", _write_kalibr, ("--imu-yaml",), kind=_imu_yaml),
+    output=Output(
+        "Kalibr's imu.yaml to write as well.",
+        _write_kalibr,
+        ("--imu-yaml",),
+        kind=("calib.stages.imu.formats", "IMU_YAML"),
+    ),
     words=_static_words,
     plots=later("calib.stages.imu.plots", "static_plots"),
 )

@@ -702,10 +702,6 @@ def _pick(gains: Sequence[Mahony], errors: FloatArray) -> Mahony:
     return gains[min((k for k in near if rank[k] == most), key=lambda k: float(errors[k]))]
 
 
-def _least(filters: Sequence[Levelling], errors: FloatArray) -> Levelling:
-    return filters[int(np.argmin(errors))]
-
-
 def _best(
     tried: Sequence[F], sums: FloatArray, pick: Callable[[Sequence[F], FloatArray], F]
 ) -> tuple[F, tuple[F, ...]]:
@@ -830,7 +826,9 @@ def tune(pieces: Sequence[Piece], sensor: Noise) -> Tuning:
         judged, parts = _parted(with_target, dt_s)
         tuned, held_out, surface = _search(judged, dt_s, parts)
         tried = [Levelling(tau, v) for tau in _TAU_S if tau >= 2.0 * dt_s for v in _VELOCITY_MPS]
-        levelling, levelling_held_out = _best(tried, _sums(judged, tried, parts), _least)
+        levelling, levelling_held_out = _best(
+            tried, _sums(judged, tried, parts), lambda filters, errors: filters[int(np.argmin(errors))]
+        )
 
         rivals, errors = [], []
         for name, gains, crossed in (
