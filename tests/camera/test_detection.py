@@ -214,6 +214,32 @@ def test_sharp_edges_are_placed_to_a_hundredth_of_a_pixel(
 
 
 @pytest.mark.parametrize(
+    ("camera", "moved"),
+    [(PIXY, np.eye(9)), (PIXY, np.eye(9)[::-1]), (VGA, np.eye(21))],
+    ids=["316x208 down", "316x208 up", "640x480 down"],
+)
+def test_boards_that_moved_aslant_are_placed_as_where_they_were_in_the_middle(
+    camera: Camera, moved: FloatArray
+) -> None:
+    """By half to all of a square, which leaves each corner two places beside the true one."""
+    for seed in range(2):
+        gray, truth = _picture(camera, Board(9, 6, 0.025), seed)
+        detection = detect(cv2.filter2D(gray, -1, moved / moved.sum()), 9, 6)
+        error = _error(detection, truth)
+        assert np.sqrt(np.mean(error**2)) < 0.05
+        assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(detection.sigma_px**2))
+
+
+def test_boards_whose_white_bleeds_into_black_are_found() -> None:
+    for seed in range(3):
+        gray, truth = _picture(PIXY, Board(9, 6, 0.025), seed)
+        lit = 1.8 * gray.astype(np.float32)
+        shine = cv2.GaussianBlur(np.maximum(lit - 160, 0), (0, 0), 3.0)
+        detection = detect(np.clip(lit + shine, 0, 255).astype(np.uint8), 9, 6)
+        assert np.abs(_error(detection, truth)).max() < 0.1
+
+
+@pytest.mark.parametrize(
     ("lit", "share"),
     [
         pytest.param(lambda u, v: 1.0, 0.75, id="even"),

@@ -377,7 +377,9 @@ _FINDERS: tuple[Callable[[GrayImage, tuple[int, int]], tuple[bool, AnyArray | No
 def _candidates(gray: GrayImage, columns: int, rows: int, quick: bool) -> Iterator[list[FloatArray]]:
     """Grids (r, c, 2) of the picture to try, stage by stage."""
     fragments = False
-    for zoom in lattice_levels(gray):
+    zooms = lattice_levels(gray)
+    # Where the board moved, or white bleeds into black, corners are saddle points in a smaller copy only.
+    for zoom in (*zooms, 0.5 * zooms[0]):
         if quick and zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS:
             continue
         level, grids = resized(gray, zoom), []
