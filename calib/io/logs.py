@@ -715,8 +715,6 @@ class Watch:
     names: tuple[str, ...] = MEASURED
     held: list[tuple[int, int]] = field(default_factory=list)
     _seen: dict[str, tuple[int, float, float]] = field(default_factory=dict)
-    _pictures: int = 0
-    _same: int = 0
     _mirrored: Finding | None = None
     _known: bool = False
     _unmoved: Finding | None = None
@@ -731,10 +729,6 @@ class Watch:
             if len(finite):
                 least, most = min(least, float(finite.min())), max(most, float(finite.max()))
             self._seen[name] = count + len(finite), least, most
-        if "u_px" in self.names and len(pictures := log.sampled("u_px", "v_px")):
-            seen = np.stack([log.columns[name][pictures] for name in ("u_px", "v_px")])
-            self._pictures += len(pictures)
-            self._same += int(np.count_nonzero((np.diff(seen) == 0.0).all(axis=0)))
         self._stuck = self._stuck or _frozen(log, self.names)
         if all(name in log.columns and name in self.names for name in IN_PLANE):
             if not self._known:
@@ -742,11 +736,6 @@ class Watch:
             self._unmoved = self._unmoved or _unmoved(log)
         self.held = _held(log) if set(self.names) & set(IMU) else []
         self._stopped = self._stopped or _stopped(log, self.held)
-
-    @property
-    def still(self) -> bool:
-        """Whether four of five pictures show the marker on the pixel of the one before."""
-        return self._same > 0.8 * self._pictures
 
     def has(self, *names: str) -> bool:
         """Whether each of these columns has a reading."""

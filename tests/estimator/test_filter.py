@@ -719,8 +719,25 @@ def test_innovations_far_smaller_than_expected_are_poor_but_for_what_is_at_rest(
         assert one.severity == severity and "are 0.02 times what the covariance expects" in one.text
     # Pumps that shake the rig are off, and a marker that rests shows the same pixel again and again.
     for name, change in (("accel", {"nis": 0.04, "inside": 0.3}), ("camera", {"correlation": 0.99})):
-        (one,) = consistent({name: SensorCheck(**{**GOOD, **change})}, {}, 1000, {"accel": 0.02}, True)
+        (one,) = consistent({name: SensorCheck(**{**GOOD, **change})}, {}, 1000, {"accel": 0.02}, 0.0)
         assert one.severity == "remark"
+
+
+def test_a_marker_that_rests_on_a_pixel_repeats_nothing() -> None:
+    """Its error is half of one at most, 1.73 deviations of what is rounded, and the same all the time."""
+
+    def repeating(e: FloatArray) -> float:
+        out = np.zeros((len(e), len(OUT)))
+        out[:, 0], out[:, OUT.index("e_u")] = 10.0 + np.arange(len(e)) / 60.0, e
+        tally = Tally(0.0126)
+        for part in np.array_split(out, 5):
+            tally.add(part)
+        return tally.repeating()
+
+    white = np.random.default_rng(1).normal(size=900)
+    assert repeating(np.full(900, 1.6)) == repeating(white) == 0.0
+    assert repeating(np.full(900, 2.4)) > 0.9
+    assert repeating(3.0 * np.sin(np.arange(900) / 20.0) + white) > 0.5
 
 
 def test_sensors_that_are_gated_out_missing_or_stuck_are_poor() -> None:

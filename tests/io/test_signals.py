@@ -86,16 +86,6 @@ def test_a_watch_sees_what_is_stuck_or_absent(changes: dict[str, Any], severity:
     assert [(one.severity, one.text) for one in found] == ([(severity, words)] if words else [])
 
 
-@pytest.mark.parametrize(("amplitude_px", "still"), [(0.0, True), (10.0, False)])
-def test_a_marker_that_rests_shows_one_pixel(amplitude_px: float, still: bool) -> None:
-    t, noise = np.arange(900) / 60.0, np.random.default_rng(2).normal(size=(2, 900))
-    u, v = np.rint(np.array([[160.2], [99.7]]) + amplitude_px * np.sin(3.0 * t) + 0.12 * noise)
-    v[::100] += 7.0
-    watch = Watch()
-    watch.add(Log("log.csv", t, {"u_px": u, "v_px": v}, np.arange(900)))
-    assert watch.still == still
-
-
 def test_a_gyroscope_that_does_not_answer_is_named() -> None:
     log = _log()
     gz, t = log.columns["gz_radps"], log.t_s

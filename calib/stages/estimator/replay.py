@@ -510,14 +510,14 @@ def sampled(watch: Watch) -> Iterator[Finding]:
 
 def consistent(
     checks: Mapping[str, SensorCheck], flags: Mapping[str, int], rows: int,
-    quiet: Mapping[str, float] | None = None, still: bool = False,
+    quiet: Mapping[str, float] | None = None, repeating: float | None = None,
 ) -> Iterator[Finding]:  # fmt: skip
     """Findings on innovations that contradict their covariance, and on stretches without a sensor.
 
     Parameters
     ----------
     quiet : by sensor the share of its variance at rest: a rig whose pumps shake it has logs without.
-    still : whether the marker rests on one pixel, which says so again and again.
+    repeating : correlation of the camera's innovations as far as it counts, of whole pixels.
     """
     for name, check in checks.items():
         rest = (quiet or {}).get(name, 1.0)
@@ -535,12 +535,13 @@ def consistent(
             if check.inside < _INSIDE_SHARE and (ratio >= 1.0 or rest > 0.5):
                 share = f"{100.0 * check.inside:.0f} % of the {name}'s innovations"
                 yield Finding("poor", f"only {share} lie in their 95 % band")
-            repeats = name in _PLACES and check.readings >= _FEWEST and not still
-            if repeats and abs(check.correlation) > _OF_CAMERA:
+            correlation = check.correlation if name != "camera" or repeating is None else repeating
+            repeats = name in _PLACES and check.readings >= _FEWEST
+            if repeats and abs(correlation) > _OF_CAMERA:
                 yield Finding(
                     "poor",
                     f"the {_PLACES[name]} contradict the IMU: their innovations repeat, "
-                    f"{check.correlation:.2f} with the one before",
+                    f"{correlation:.2f} with the one before",
                     "check the columns of this log: their order, signs, units and times"
                     + (", and where the base is" if name == "pose" else ""),
                 )
@@ -926,8 +927,8 @@ def _replayed(
         findings += captured(log.first, log.periods.pose)
         if log.both and not log.periods.pose:
             findings += jumped(tally)
-        still = log.periods.grid_px > 0.0 and sums.watch.still
-        findings += consistent(checks, flags, max(tally.rows, 1), log.quiet, still)
+        repeating = tally.repeating() if log.periods.grid_px > 0.0 else None
+        findings += consistent(checks, flags, max(tally.rows, 1), log.quiet, repeating)
         if not tally.end_s - tally.start_s >= SETTLED_S:
             text = f"the log is too short: innovations are judged from {SETTLED_S:g} s on"
             findings.append(Finding("poor", text))
