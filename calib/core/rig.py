@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -342,6 +343,18 @@ class Rig:
     def marker_offset_m(self) -> float:
         """Marker beyond the head along its tangent (A.1), as drawn."""
         return (self.geometry or Geometry()).marker_offset_m
+
+    @property
+    def shift_sigma_m(self) -> tuple[float, float] | None:
+        """Deviations of the marker's shift in the plane along x and y; None without a plane.
+
+        That along y is the calibration's alone. Across the head a marker is as far from its drawing as along.
+        """
+        largest = self.plane.sigma_marker_mm.get("calibration_max") if self.plane is not None else None
+        if largest is None:
+            return None
+        shift = 1e-3 * largest / math.sqrt(2.0)
+        return math.hypot(shift, (self.geometry or Geometry()).marker_offset_sigma_m), shift
 
     @property
     def middle_m(self) -> tuple[float, float]:

@@ -9,10 +9,11 @@ off) and the asymmetry of the pumps are drawn by its seed. Its folder is made as
 then once more after `calib identify` on the logs that were aligned. Nothing is taken from the truth but the
 errors. `--keep` leaves the calibrated folders for another run, which replays only.
 
-The marker sits where its drawing says, or off from there with the deviation `--off`, which rig.yaml then
-states, as one states what a caliper tells. `--raised` moves it nearer to the camera than the board lay, or
-farther from it, by a share with the deviation that `align` expects of the plane's stretch. `--undrawn` says
-in rig.yaml that the drawing is good to 3 mm, so that the logs have to find the marker. `--wrong` makes the
+The marker sits where its drawing says, or off from there, along the head and across, with the deviation
+`--off`, which rig.yaml then states, as one states what a caliper tells. `--raised` moves it nearer to the
+camera than the board lay, or farther from it, by a share with the deviation that `align` expects of the
+plane's stretch. `--undrawn` says in rig.yaml that the drawing is good to 3 mm, so that the logs have to find
+the marker. `--wrong` makes the
 rigs in a way that the model does not know (`WRONG`); with `--keep` they take the pictures of the right rig.
 
 Errors are the mean over q1 and q2 in millimetres after two seconds: their mean over rigs and their 95th
@@ -142,6 +143,12 @@ def above_board(rig: SimulatedRig, seed: int) -> SimulatedRig:
     return replace(rig, view=replace(rig.view, t_CW_m=rig.view.t_CW_m + nearer))
 
 
+def aside(rig: SimulatedRig, seed: int, off_mm: float) -> SimulatedRig:
+    """The rig whose marker sits across the head from its drawing."""
+    across = 1e-3 * off_mm * float(np.random.default_rng(6000 + seed).normal())
+    return replace(rig, view=replace(rig.view, t_CW_m=rig.view.t_CW_m + across * rig.view.R_CW[:, 0]))
+
+
 def _log(
     rig: SimulatedRig, kind: str, options: dict[str, str], seed: int, span: float | None, play: bool
 ) -> str:
@@ -163,7 +170,8 @@ def make(folder: Path, seed: int, off_mm: float, raised: bool, wrong: str | None
         write_rig_folder(folder, rig, seed)
     if raised:
         rig = above_board(rig, seed)
-    if wrong or raised:
+    rig = aside(rig, seed, off_mm)
+    if wrong or raised or off_mm:
         for k, name in enumerate((*RESTS, *ALIGNED)):
             text = _log(rig, *LOGS[name], 1000 * seed + k, None, wrong == "hysteresis")
             (folder / "logs" / f"{name}.csv").write_text(text)

@@ -24,6 +24,7 @@ from calib.stages.camera.model import (
     vector_from_camera,
 )
 from calib.stages.camera.plane import (
+    BoardPlace,
     calibrate_plane,
     compare_pictures,
     position_sigma,
@@ -134,6 +135,27 @@ def test_the_pose_takes_over_the_errors_of_the_intrinsics() -> None:
     np.testing.assert_allclose(with_camera - alone, E @ spread @ E.T, atol=1e-15)
     spread[0, 0] = np.inf
     assert np.all(np.diag(calibrate_plane(THESIS, spread, [view]).covariance) == np.inf)
+
+
+def test_sigma_holds_where_the_board_may_lie() -> None:
+    """The pose's covariance is that of boards that were laid a little elsewhere and look the same."""
+    corner, angle, step, view = np.array([-0.06, 0.02]), 0.1, 1e-5, picture(IDEAL)
+    moves = ((step, 0.0, 0.0), (0.0, step, 0.0), (0.0, 0.0, step))
+    away = []
+    for x, y, turn in moves:
+        world = world_points_m(BOARD, np.add(corner, (x, y)), angle + turn)
+        plane = calibrate_plane(IDEAL, None, [View("p", world, view.pixels)])
+        twist = plane.R_CW @ R_TRUE.T
+        away.append([twist[2, 1], twist[0, 2], twist[1, 0], *(plane.t_CW_m - T_TRUE)])
+    laid, turned = np.array(away[:2]), np.array(away[2])
+    for place, expected in (
+        (BoardPlace((-0.06, 0.02), corner_sigma_m=step), laid.T @ laid),
+        (BoardPlace((-0.06, 0.02), angle_sigma_rad=step), np.outer(turned, turned)),
+    ):
+        np.testing.assert_allclose(place.covariance(R_TRUE), expected, atol=1e-3 * step**2)
+    plane = calibrate_plane(IDEAL, None, [view], placed=BoardPlace((-0.06, 0.02), 3e-4, 2e-3))
+    by_turn = 2.0 * np.abs(plane.sigma.points_m - corner)[:, ::-1]
+    np.testing.assert_allclose(plane.sigma.plane_mm, np.hypot(0.3, by_turn), rtol=1e-4)
 
 
 @pytest.mark.slow

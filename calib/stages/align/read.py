@@ -11,7 +11,7 @@ import numpy as np
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.logs import Log, held_places, unclipped
-from calib.stages.align.solve import AlignLog, Settings
+from calib.stages.align.solve import ASIDE_M, AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import QUANTITIES, sensor_values, view_coefficients
 
@@ -63,10 +63,9 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
 
 def _prior(rig: Rig) -> dict[str, tuple[float, float]]:
     values = dict(PRIOR)
-    largest = rig.plane.sigma_marker_mm.get("calibration_max") if rig.plane is not None else None
-    if largest is not None:
-        shift = max(1e-3 * largest / math.sqrt(2.0), _LEAST_SHIFT_M)
-        values["shift_x_m"] = values["shift_y_m"] = (0.0, shift)
+    if (shifts := rig.shift_sigma_m) is not None:
+        aside, shift = (max(sigma, _LEAST_SHIFT_M) for sigma in shifts)
+        values["shift_x_m"], values["shift_y_m"] = (0.0, math.hypot(aside, ASIDE_M)), (0.0, shift)
     known = rig.imu_intrinsics
     if known is None:
         return values
@@ -112,5 +111,7 @@ def settings_from_rig(
         sensor_values({name: value for name, (value, _) in values.items()}),
         sensor_values({name: sigma for name, (_, sigma) in values.items()}),
         grid_px(pixels),
+        aside_sigma_m=tuple(max(sigma, _LEAST_SHIFT_M) for sigma in rig.shift_sigma_m or ()),
+        turn_sigma_rad=plane.sigma.get("rotation_z_rad") or 0.0,
         **walks,
     )

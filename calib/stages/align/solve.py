@@ -33,7 +33,7 @@ from calib.stages.align.spline import (
     imu_rows,
     normal_sums,
 )
-from calib.stages.estimator.sensors import GRAVITY_MPS2, QUANTITIES, SENSOR, SIZE, heads_seen, truncated
+from calib.stages.estimator.sensors import GRAVITY_MPS2, HEAD, QUANTITIES, SENSOR, SIZE, heads_seen, truncated
 
 # ----------------------------------------------------------------------
 # How well readings fit: whole pixels with outliers, and readings of the IMU.
@@ -922,6 +922,11 @@ _AX, _AY, _MOUNT, _OFFSET, _MARKER = (
     )
 )  # fmt: skip
 _SX, _SY = SENSOR.index("accel_scale_x"), SENSOR.index("accel_scale_y")
+_SHIFT_X = SENSOR.index("shift_x_m")
+_SHIFT, _STRETCH = (
+    [len(HEAD) + SENSOR.index(f"shift_{axis}_m") for axis in "xy"],
+    len(HEAD) + SENSOR.index("stretch"),
+)
 
 
 @dataclass(frozen=True)
@@ -933,6 +938,9 @@ class Settings:
     view : (25,) of `sensors.view_coefficients`.
     mean, sigma : (14,) prior of `SENSOR`. The mount angle's mean is replaced by a first guess.
     grid_px : step of the pixels. gyro_walk, accel_walk : densities K of the biases' walk.
+    aside_sigma_m : how far the marker is across a straight head: as its drawing tells, and on its axis but
+        for the calibration; empty where `sigma` is all that is known. turn_sigma_rad : how well the plane's
+        direction is known.
     """
 
     view: FloatArray
@@ -941,6 +949,8 @@ class Settings:
     grid_px: float = 1.0
     gyro_walk: float = 1e-5
     accel_walk: float = 1e-4
+    aside_sigma_m: tuple[float, ...] = ()
+    turn_sigma_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -977,6 +987,8 @@ class Alignment:
     clock_s : by how much steps of the logs' clocks may move the offset.
     pace, pace_sigma : by which share the camera's clock is faster than the IMU's.
     span_s : of the longest stretch. apart : logs in which a quantity is another one.
+    aside_m : how far across the head the logs alone place the marker, with its deviation, where that is
+        farther than drawing and calibration allow.
     """
 
     sensor: FloatArray
@@ -997,6 +1009,7 @@ class Alignment:
     pace_sigma: float = math.inf
     span_s: float = 0.0
     apart: tuple[Apart, ...] = ()
+    aside_m: tuple[float, float] | None = None
 
     @property
     def sigma(self) -> FloatArray:
@@ -1097,6 +1110,28 @@ def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
         for walk in walks:
             moved = response(problem, fit, i, walk * math.sqrt(duration / 3.0))
             total += np.outer(moved, moved)
+    return total
+
+
+def turned(problem: Problem, fit: Fit) -> FloatArray:
+    """Change (14,) of the quantities per radian by which the world's axes lie turned about its middle.
+
+    Turned axes look like a bent head: at rest the marker is as far aside, and only the curve of its path
+    differs. No quantity stands for them.
+    """
+    total = np.zeros(len(SENSOR))
+    for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
+        to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
+        for off, rows in _pictures(problem, stretch, c, fit.sensor):
+            _, _, weight, _ = _picture_terms(problem, fit.noise, off)
+            seen = (weight > 0.0).all(axis=1) & np.isfinite(rows.by).all(axis=(1, 2))
+            by = rows.by[seen]
+            # Stretching moves the marker away from the middle, turning across that.
+            by_place = by[:, :, _SHIFT]
+            away = np.linalg.solve(by_place, by[:, :, _STRETCH, None])
+            across = by_place @ (away[:, ::-1] * np.array([[-1.0], [1.0]]))
+            gathered(rows.span[seen], rows.basis[seen], by, -weight[seen] * across[:, :, 0], to_c, to_s)
+        total += cho_solve(fit.arrow.S, to_s - fit.arrow.B[i].T @ fit.arrow.own(i, to_c))
     return total
 
 
@@ -1250,7 +1285,8 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     sensor = mean.copy()
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)
-    covariance = fit.covariance + _walked(settings, problem, fit)
+    moved = settings.turn_sigma_rad * turned(problem, fit)
+    covariance = fit.covariance + _walked(settings, problem, fit) + np.outer(moved, moved)
     apart = _apart(problem, fit, len(logs))
     for one in apart:
         covariance += np.outer(one.moved, one.moved)
@@ -1263,12 +1299,66 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     checks = tuple(
         _check(number, log, pieces, first.stretches, fit, traces) for number, log in enumerate(logs)
     )
-    return Alignment(
+    found = Alignment(
         fit.sensor, covariance, mean, settings.sigma, fit.noise, fit.converged, fit.steps, first.moves,
         first.factor, checks, traces, correlation(pieces), tuple(said), clock_s,
         *_pace(pieces, float(fit.sensor[_OFFSET])),
         max(float(np.ptp(piece.camera.t_s)) for piece in pieces), tuple(apart),
     )  # fmt: skip
+    return _centred(found, settings.aside_sigma_m) if settings.aside_sigma_m else found
+
+
+# ----------------------------------------------------------------------
+# The marker across the head.
+#
+# A marker aside and a plane that lies aside are one at a straight head, and there look like a bent one: 0.05
+# mm are 0.06 degrees. So it matters what is taken for likely. The fit takes next to nothing for known, within
+# `ASIDE_M`; then each of three kinds is weighed by how well the logs bear it: on the axis as the
+# calibration tells, off it as the drawing's deviation allows, or elsewhere, as of a board that was laid
+# with a ruler.
+
+ASIDE_M = 3e-4
+_KINDS = np.array([0.5, 0.48, 0.02])
+"""Probabilities beforehand: on the axis, within the drawing's deviation, elsewhere."""
+_SURELY_ELSEWHERE = 0.9
+
+
+def _mixed(
+    found: Alignment, k: int, away: float, sums: FloatArray, likely: FloatArray
+) -> tuple[Alignment, FloatArray]:
+    """An alignment with one more reading of quantity k, of several kinds, and the kinds' probabilities.
+
+    Mean and covariance are those of the mixture.
+
+    Parameters
+    ----------
+    away : the reading less the value. sums : variance of that by kind, infinite of one that says nothing.
+    likely : of the kinds, up to a factor.
+    """
+    weight, by = likely / likely.sum(), found.covariance[k]
+    # All quantities move along their covariance with k, by these amounts of k per variance.
+    pulls = away / sums
+    pull = float(weight @ pulls)
+    spread = float(weight @ (1.0 / sums) - weight @ (pulls - pull) ** 2)
+    sensor, covariance = found.sensor + by * pull, found.covariance - spread * np.outer(by, by)
+    return replace(found, sensor=sensor, covariance=covariance), weight
+
+
+def _centred(found: Alignment, aside_sigma_m: tuple[float, ...]) -> Alignment:
+    """An alignment with what is likely of the marker across the head; the fit held it to a wide prior."""
+    wide, value, known = float(found.prior[_SHIFT_X]), float(found.sensor[_SHIFT_X]), found.sigma[_SHIFT_X]
+    drawn, calibrated = aside_sigma_m
+    kinds = np.array([calibrated, drawn, wide])
+    # A narrower prior is the wide one and one more reading of zero.
+    with np.errstate(divide="ignore"):
+        more = 1.0 / np.maximum(1.0 / kinds**2 - 1.0 / wide**2, 0.0)
+        sums = more + known**2
+        likely = _KINDS * wide / kinds * np.exp(-0.5 * value**2 / sums) / np.sqrt(1.0 + known**2 / more)
+    centred, weight = _mixed(found, _SHIFT_X, -value, sums, likely)
+    if weight[2] < _SURELY_ELSEWHERE:
+        return centred
+    told = 1.0 - min(known / wide, 1.0) ** 2
+    return replace(centred, aside_m=(value / told, wide * math.sqrt((1.0 - told) / told)))
 
 
 # ----------------------------------------------------------------------
@@ -1406,7 +1496,8 @@ def _differing(found: Alignment) -> Iterator[Finding]:
 _SHOWN = {"": (100.0, "%"), "m": (1e3, "mm"), "s": (1e3, "ms"), "rad": (180.0 / math.pi, "deg")}
 _SHIFTS = ("shift_x_m", "shift_y_m", "stretch")
 _MOVED = (
-    "find the plane again: its board lay elsewhere or has another square, or the camera has moved since; a "
+    "find the plane again: its board lay elsewhere (state first_corner_sigma_m and angle_sigma_rad in "
+    "board.yaml) or has another square, the marker sits aside, or the camera has moved since; a "
     "video may store its colours half a pixel aside, which moves the marker by 0.4 px"
 )
 
@@ -1437,6 +1528,13 @@ def _known(found: Alignment) -> Iterator[Finding]:
         )
     for k, name in enumerate(SENSOR):
         away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
+        if k == _SHIFT_X and found.aside_m is not None:
+            value, spread = (1e3 * x for x in found.aside_m)
+            yield Finding(
+                "poor",
+                f"by the logs the plane is {value:.2g} +- {spread:.1g} mm aside, or the marker on the head",
+                _MOVED,
+            )
         # A delay that the logs tell is a delay, however long.
         if away > _BEYOND_PRIOR and (k != _OFFSET or offset > _OFFSET_S[0]):
             # In the units of the table.
@@ -1501,22 +1599,15 @@ def with_drawn_marker(found: Alignment, geometry: Geometry) -> tuple[Alignment, 
     """
     written = "marker_offset_m" in geometry.model_fields_set
     drawn, sigma = geometry.marker_offset_m, geometry.marker_offset_sigma_m
-    value, by = float(found.sensor[_MARKER]), found.covariance[_MARKER]
+    value = float(found.sensor[_MARKER])
     doubt, away = _DOUBT[written], drawn - value
-    sums = by[_MARKER] + np.array([sigma, math.hypot(sigma, _ELSEWHERE_M)]) ** 2
+    sums = found.sigma[_MARKER] ** 2 + np.array([sigma, math.hypot(sigma, _ELSEWHERE_M)]) ** 2
     likely = np.array([1.0 - doubt, doubt]) * np.exp(-0.5 * away * away / sums) / np.sqrt(sums)
-    weight = likely / likely.sum()
-    # Both kinds move all quantities along their covariance with d, by these amounts of d per variance.
-    pulls = away / sums
-    pull = float(weight @ pulls)
-    spread = float(weight @ (1.0 / sums) - weight @ (pulls - pull) ** 2)
-    sensor = found.sensor + by * pull
-    covariance = found.covariance - spread * np.outer(by, by)
-    mixed = replace(found, sensor=sensor, covariance=covariance)
+    mixed, weight = _mixed(found, _MARKER, away, sums, likely)
     both = (
         f"the marker's offset d: {_mm(drawn, sigma)} as drawn (geometry.marker_offset_m), "
-        f"{_mm(value, math.sqrt(float(by[_MARKER])))} by the logs alone, "
-        f"{_mm(float(sensor[_MARKER]), math.sqrt(float(covariance[_MARKER, _MARKER])))} together"
+        f"{_mm(value, float(found.sigma[_MARKER]))} by the logs alone, "
+        f"{_mm(float(mixed.sensor[_MARKER]), float(mixed.sigma[_MARKER]))} together"
     )
     if weight[0] < 0.5:
         both += "; drawing and logs contradict each other, and the logs are believed"

@@ -447,6 +447,33 @@ class Plane(Pose):
         return np.asarray(np.linalg.inv(self.A), dtype=np.float64)
 
 
+@dataclass(frozen=True)
+class BoardPlace:
+    """Where the board lies in the plane, as far as a ruler tells.
+
+    Attributes
+    ----------
+    first_corner_m : world position of corner (0, 0).
+    corner_sigma_m, angle_sigma_rad : standard deviations of its x and y, and of the board's direction.
+    """
+
+    first_corner_m: tuple[float, float]
+    corner_sigma_m: float = 0.0
+    angle_sigma_rad: float = 0.0
+
+    def covariance(self, R_CW: FloatArray) -> FloatArray:
+        """What it leaves open of the pose (w, t), (6, 6): the board as seen stays, the world moves under it.
+
+        A world that moves by e and turns by a about the corner c shows X where X + e + a z x (X - c) was.
+        """
+        across = np.array([-self.first_corner_m[1], self.first_corner_m[0]])
+        J = np.zeros((6, 3))
+        J[:3, 2] = -R_CW[:, 2]
+        J[3:, :2] = -R_CW[:, :2]
+        J[3:, 2] = R_CW[:, :2] @ across
+        return J @ np.diag([self.corner_sigma_m**2, self.corner_sigma_m**2, self.angle_sigma_rad**2]) @ J.T
+
+
 def calibrate_plane(
     camera: Camera,
     camera_covariance: FloatArray | None,
@@ -454,6 +481,7 @@ def calibrate_plane(
     *,
     workspace_m: tuple[float, float, float, float] | None = None,
     camera_rms_px: float | None = None,
+    placed: BoardPlace | None = None,
 ) -> Plane:
     """Fit one pose of the world's plane to all pictures of it, taken by a camera that stands still.
 
@@ -465,6 +493,7 @@ def calibrate_plane(
     workspace_m : box (x0, y0, x1, y1) over which the uncertainty is reported; by default the box
         around the corners, which the source document takes for the marker's range.
     camera_rms_px : RMS of the camera's own calibration, to compare this one with.
+    placed : how well the board's place is known; exactly by default.
 
     Raises
     ------
@@ -476,7 +505,8 @@ def calibrate_plane(
     pose = fit_pose(camera, world_m, pixels, _same_points(world_m))
     pictures, comparison = compare_pictures(camera, views, pose)
     inflation = max(comparison.inflation, _alike(views, pose.residuals_px))
-    pose = replace(pose, covariance=pose.covariance * inflation)
+    placing = np.zeros((6, 6)) if placed is None else placed.covariance(pose.R_CW)
+    pose = replace(pose, covariance=pose.covariance * inflation + placing)
 
     box = workspace_m
     if box is None:

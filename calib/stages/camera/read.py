@@ -49,6 +49,7 @@ Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Position = Annotated[list[Place], Field(min_length=2, max_length=2)]
 Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, strict=True)]
+Spread = Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False, strict=True)]
 
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
@@ -59,8 +60,9 @@ class BoardFile(BaseModel):
     """board.yaml: the board, and for a plane where it lies.
 
     `corners` counts inner corners, columns x rows. `first_corner_m` is the world position of corner
-    (0, 0), `angle_rad` the direction of the columns axis, `first_corner_px` where a picture shows
-    corner (0, 0), for boards that look the same after half a turn. `dictionary` is that of a ChArUco
+    (0, 0), `angle_rad` the direction of the columns axis, `first_corner_sigma_m` (of x and y each) and
+    `angle_sigma_rad` how well a ruler tells them. `first_corner_px` is where a picture shows corner
+    (0, 0), for boards that look the same after half a turn. `dictionary` is that of a ChArUco
     board's markers, as 4X4_50; without it such a board is found by itself. `simulated` says that the
     pictures are renderings.
     """
@@ -72,6 +74,8 @@ class BoardFile(BaseModel):
     dictionary: Annotated[str, Field(max_length=40)] | None = None
     first_corner_m: Position | None = None
     angle_rad: Angle | None = None
+    first_corner_sigma_m: Spread = 0.0
+    angle_sigma_rad: Spread = 0.0
     first_corner_px: Pixel | None = None
     simulated: bool = False
 

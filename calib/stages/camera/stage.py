@@ -216,7 +216,7 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> tuple[Any, ...]:
     from calib.core.files import shown
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
-    from calib.stages.camera.plane import settle_orientation, world_points_m
+    from calib.stages.camera.plane import BoardPlace, settle_orientation, world_points_m
     from calib.stages.camera.read import BOARD_FILE, board_of, find_boards, meant_folder
 
     del options
@@ -257,7 +257,9 @@ def _read_plane(files: Files, rig: Rig, options: NoOptions) -> tuple[Any, ...]:
         views.append(View(view.name, world_m[kept], pixels[kept]))
         orientation.append(f"{view.name}: {how}")
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
-    return rig.camera, views, rig.workspace_m, orientation, doubt, search.left_out, stated.simulated
+    x, y = stated.first_corner_m
+    place = BoardPlace((x, y), stated.first_corner_sigma_m, stated.angle_sigma_rad)
+    return rig.camera, views, rig.workspace_m, orientation, doubt, search.left_out, stated.simulated, place
 
 
 def _solve_plane(
@@ -268,6 +270,7 @@ def _solve_plane(
     doubt: str,
     left_out: tuple[LeftOut, ...],
     simulated: bool,
+    placed: plane.BoardPlace,
 ) -> Plane:
     """Fit views of the board in world metres, judge, and assemble the section."""
     import numpy as np
@@ -277,8 +280,10 @@ def _solve_plane(
     from calib.stages.camera.plane import calibrate_plane
     from calib.stages.camera.section import Plane
 
-    optics, covariance = camera.optics, camera.intrinsic_covariance
-    fit = calibrate_plane(optics, covariance, views, workspace_m=workspace_m, camera_rms_px=camera.rms_px)
+    optics, covariance, box = camera.optics, camera.intrinsic_covariance, workspace_m
+    fit = calibrate_plane(
+        optics, covariance, views, workspace_m=box, camera_rms_px=camera.rms_px, placed=placed
+    )  # fmt: skip
     findings = [*fit.verdict.findings]
     if doubt:
         advice = "state which it is with first_corner_px: [u, v] in board.yaml"

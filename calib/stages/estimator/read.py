@@ -283,10 +283,8 @@ def _place_view() -> FloatArray:
 def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | None, list[str]]:
     """Values and deviations of the sensors, their covariance, and sentences for what is only assumed."""
     values, said = {name: (one.usual, one.assumed) for name, one in QUANTITIES.items()}, list[str]()
-    plane = rig.plane
-    if plane is not None and plane.sigma_marker_mm.get("calibration_max") is not None:
-        shift = 1e-3 * float(plane.sigma_marker_mm["calibration_max"] or 0.0) / math.sqrt(2.0)
-        values["shift_x_m"] = values["shift_y_m"] = (0.0, max(shift, 1e-6))
+    if (shifts := rig.shift_sigma_m) is not None:
+        values["shift_x_m"], values["shift_y_m"] = ((0.0, max(sigma, 1e-6)) for sigma in shifts)
     if rig.imu is not None and rig.imu.gyro_bias_radps[2] is not None:
         listed = rig.imu.sigma.get("gyro_bias_radps")
         sigma = listed[2] if listed is not None else None
