@@ -531,8 +531,10 @@ def consistent(
                     f"the innovations of the {name} are {ratio:.2g} times what the covariance expects"
                     + ("" if name == "pose" else "; calib replay --tune learns the noise of this rig"),
                 )
-            # Below their band are innovations that are as quiet as at rest.
-            if check.inside < _INSIDE_SHARE and (ratio >= 1.0 or rest > 0.5):
+            # Below their band are innovations that are as quiet as at rest, and those of a marker that rests
+            # on the middle of a pixel and so is exactly there again and again.
+            judged = name != "camera" and (ratio >= 1.0 or rest > 0.5)
+            if judged and check.inside < _INSIDE_SHARE:
                 share = f"{100.0 * check.inside:.0f} % of the {name}'s innovations"
                 yield Finding("poor", f"only {share} lie in their 95 % band")
             correlation = check.correlation if name != "camera" or repeating is None else repeating
