@@ -511,6 +511,17 @@ def _charuco(rng: np.random.Generator) -> np.ndarray:
     return _seen(board.generateImage((580, 420), marginSize=10), rng)
 
 
+@pytest.mark.parametrize("share", [0.4, 0.5, 0.65])
+def test_boards_with_markers_are_not_read_as_plain_ones(share: float) -> None:
+    """Markers of half the square's side begin at its quarters, smaller ones further in."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    board = cv2.aruco.CharucoBoard((7, 5), 1.0, share, dictionary)
+    target = board.generateImage((580, 420), marginSize=10)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        assert detect(_finished(_seen(target, rng), rng), 6, 4) is None, seed
+
+
 KINDS = [
     _noise,
     _stripes,

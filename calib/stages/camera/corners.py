@@ -103,10 +103,15 @@ _REACH_PX = 10
 _ITERATIONS = 8
 _UNEVEN_SHARE = 0.4
 """Largest share of squares that a shadow's edge may cross."""
+_MARKED_SHARE = 0.7
+"""Largest share of bright squares that may show something in their middle: on boards with markers all do."""
 _LEAST_STEP = 0.38
 """Least step between neighbouring squares over the step at the corners."""
 _FLAT = 0.6
 """Largest difference between the quarters of a square, over the step from dark to bright."""
+
+_INWARD = (0.5, 0.65, 0.8, 1.0)
+"""Where a square is looked at, as shares of the way from its corners to its middle."""
 
 _SMOOTHED_PX = 12.0
 """Side of squares from which on their tones are averages over 3 x 3 pixels."""
@@ -130,8 +135,10 @@ def _squares_are_plain(grid: Refined) -> bool:
     middle = corners.mean(axis=0)
     beside = [-1, 0, 1] if square_px(p) > _SMOOTHED_PX else [0]
     around = np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 1, 1, 1, 2)
-    quarters = sample(grid.part.image, 0.5 * (corners + middle) + around).mean(axis=0)
-    tone = quarters.mean(axis=0)
+    # From the quarters, where a marker of half the square's side begins, to the middle.
+    inward = np.array(_INWARD)[:, None, None, None, None, None]
+    tones = sample(grid.part.image, corners + inward * (middle - corners) + around).mean(axis=1)
+    tone = tones[0].mean(axis=0)
     bright = grid.sign * checkered(*tone.shape) > 0
     step = 2.0 * float(np.median(np.abs(grid.amplitude)))
     amplitude = np.abs(grid.amplitude)
@@ -142,8 +149,12 @@ def _squares_are_plain(grid: Refined) -> bool:
         across, down = signed[:, 1:] + signed[:, :-1], signed[1:] + signed[:-1]
         if min(across.min(initial=np.inf), down.min(initial=np.inf)) < _LEAST_STEP * float(local.min()):
             return False
-    uneven = quarters.max(axis=0) - quarters.min(axis=0)
-    return bool(np.mean(uneven > _FLAT * np.maximum(local, 0.25 * step)) < _UNEVEN_SHARE)
+    uneven, marked = (
+        np.ptp(some.reshape(-1, *tone.shape), axis=0) > _FLAT * np.maximum(local, 0.25 * step)
+        for some in (tones[0], tones)
+    )
+    few_marked = np.sum(marked & bright) <= _MARKED_SHARE * np.sum(bright)
+    return bool(np.mean(uneven) < _UNEVEN_SHARE and few_marked)
 
 
 def _squares_meet(grid: Refined) -> bool:
