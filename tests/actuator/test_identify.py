@@ -246,6 +246,17 @@ def test_coloured_residuals_raise_the_deviations(solution: Solution) -> None:
     assert not any(colour.white for colour in colour_of(again))
 
 
+@pytest.mark.parametrize(("sharper", "severity"), [(1.0, "poor"), (20.0, "remark")])
+def test_what_a_model_misses_counts_in_millimetres(solution: Solution, sharper: float, severity: str) -> None:
+    """Of a camera that sees more than a Pixy2 residuals are many deviations, and little."""
+    tracks = [replace(one, whitening=sharper * one.whitening) for one in solution.problem.tracks]
+    problem, residual = replace(solution.problem, tracks=tracks), 4.0 * solution.residual
+    unlike = replace(solution, problem=problem, residual=residual, J=sharper * solution.J)
+    found = judge(unlike, uncertainty(unlike), colour_of(unlike), [], [])
+    (one,) = (one for one in found.findings if "what the sensor's noise explains" in one.text)
+    assert one.severity == severity
+
+
 def test_residuals_that_last_for_seconds_count_as_few(
     solution: Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:
