@@ -1318,7 +1318,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
 # with a ruler.
 
 ASIDE_M = 3e-4
-_KINDS = np.array([0.5, 0.48, 0.02])
+_KINDS = np.array([0.5, 0.495, 0.005])
 """Probabilities beforehand: on the axis, within the drawing's deviation, elsewhere."""
 _SURELY_ELSEWHERE = 0.9
 

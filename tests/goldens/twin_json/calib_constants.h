@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x4B57668FUL
+#define CALIB_ID 0x52E9C030UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -119,12 +119,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365892355f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.85106856e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599108279f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93350264e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362181454f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160735592f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365892332f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.85111731e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599106073f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93350191e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362181431f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160735577f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000316923106f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000871971366f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.76387095f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -133,11 +133,11 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00044286f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241295695f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202497803f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216922145f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987370312f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.00044274f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241297018f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202477369f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216922127f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987370253f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_23 0.220938608f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0866548419f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237714723f /* row 3, A^-1 K, dimensionless to m */
@@ -149,12 +149,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369091076f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82845416e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604376078f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.22143814e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.0036319897f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160436273f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.00369091053f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82851673e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604373872f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.22143741e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363198947f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160436258f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000437254144f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111405493f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81176996f /* row 3, distorted px to m */
@@ -165,7 +165,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.494447082f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.494447857f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -174,11 +174,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0143830162f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0678978488f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.01722741f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.00578960683f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228951834f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0143828597f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0678986162f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.01722753f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00578960404f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228833798f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -192,13 +192,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0163866486f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.48722445e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0163866468f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.48721936e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.014572707f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145731075f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -220,7 +220,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0651544854f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0651542917f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -234,22 +234,22 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.50555289f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.00025292096f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.8914593e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.03778358e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.79168363e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000257278152f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.73853314e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00250567985f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000255420979f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00819332432f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.74361223e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.374392003f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.30223227f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.6044645f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00251948577f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.187960312f /* K_m, dimensionless */
+#define CALIB_FUSED_DELAY_TICKS 1.50555217f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000252918166f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.88835655e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.037498e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.78863273e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000257275329f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.73853823e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00250565144f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000255418068f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00819332339f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.74360968e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.374392211f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.30219841f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.6043968f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.0025194874f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.187960297f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00686438661f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.00904223416f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
@@ -307,19 +307,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0651544854f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0651542917f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.214951f, 139.699829f, 149.125626f, 157.553543f, 165.459106f,
-    173.091721f, 180.614288f, 188.187637f, 195.979919f, 204.201355f, 213.210648f,
-    223.81514f, 240.722061f, 253.5f,
+    99.75f, 128.214951f, 139.699844f, 149.125641f, 157.553558f, 165.459122f,
+    173.091736f, 180.614304f, 188.187668f, 195.97995f, 204.201401f, 213.210693f,
+    223.815201f, 240.722229f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0451544859f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.11515449f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0451542884f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115154289f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
