@@ -178,7 +178,7 @@ _OTHER_FILES = (
 
 
 def shows(block: str, verbs: Iterable[str]) -> bool:
-    return block.startswith(tuple(f"$ calib {verb} " for verb in verbs))
+    return block.startswith(tuple(f"$ calib {verb}" for verb in verbs))
 
 
 @pytest.mark.slow
