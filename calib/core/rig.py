@@ -72,6 +72,8 @@ KINDS = {
 """Sections in the order of the file and what they are. A schema takes a tenth of a second to build, so each
 is loaded where a file has its section."""
 
+_MOST_ASIDE_M = 3e-4
+"""Deviation of a marker across the head, that was put there by eye."""
 ARM_KIND = "pressure_arm"
 """Kind of an actuator whose section is that of an arm."""
 
@@ -348,13 +350,15 @@ class Rig:
     def shift_sigma_m(self) -> tuple[float, float] | None:
         """Deviations of the marker's shift in the plane along x and y; None without a plane.
 
-        That along y is the calibration's alone. Across the head a marker is as far from its drawing as along.
+        That along y is the calibration's alone. Across the head a marker is as far from its drawing as along
+        it, though not by more than one that was put there by eye.
         """
         largest = self.plane.sigma_marker_mm.get("calibration_max") if self.plane is not None else None
         if largest is None:
             return None
         shift = 1e-3 * largest / math.sqrt(2.0)
-        return math.hypot(shift, (self.geometry or Geometry()).marker_offset_sigma_m), shift
+        aside = min((self.geometry or Geometry()).marker_offset_sigma_m, _MOST_ASIDE_M)
+        return math.hypot(shift, aside), shift
 
     @property
     def middle_m(self) -> tuple[float, float]:
