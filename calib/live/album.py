@@ -22,6 +22,7 @@ from calib.stages.camera.options import Told
 from calib.stages.camera.read import BOARD_FILE, BoardFile, read_board_file, read_views
 
 if TYPE_CHECKING:
+    from calib.stages.camera.intrinsics import Intrinsics
     from calib.stages.camera.section import Camera, Plane
 
 MOST_PICTURES = 300
@@ -188,6 +189,13 @@ class Album:
         made = stage(verb)
         files = Files((pictures,), self.rig, figures=False, keep=False)
         return carry_out(made, files, options_of(made.options, {}), self.rig)[0]
+
+
+def fit_of(album: Album | None) -> Intrinsics | None:
+    """Calibrate an album's pictures as `Album.calibrate`, for a process of its own; None makes that ready."""
+    import calib.runner.work  # noqa: F401  takes longer to load than some pictures to fit
+
+    return None if album is None else album.calibrate().evidence
 
 
 def _names(folder: Path) -> list[str]:

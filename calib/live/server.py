@@ -37,8 +37,9 @@ from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError, CalibError
 from calib.core.files import read_bytes, shown
 from calib.core.rig import Rig
+from calib.core.workers import Failure, Pool, Task, run_tasks
 from calib.io.pictures import declared_pixels, decoded_picture
-from calib.live.album import MOST_PICTURES, Album
+from calib.live.album import MOST_PICTURES, Album, fit_of
 from calib.live.board import Board
 from calib.live.marker import Marker
 from calib.live.plane import Flat
@@ -110,6 +111,8 @@ class Live:
         self._lent: _Tab | None = None
         self._looking = ThreadPoolExecutor(1, "look")
         self._fitting = ThreadPoolExecutor(1, "fit")
+        # Of its own, so that no frame waits for the interpreter while pictures are fitted.
+        self._process = Pool(1)
         self._wanted, self._fits = 0, 0
         self._by_hand = False
         self._known: tuple[Any, Any] = (None, None)
@@ -200,6 +203,8 @@ class Live:
         """Where a frame has told the size of the picture or of the board, the outline is another one."""
         learnt = self.session.size_px, self.session.corners
         if learnt != self._known:
+            if self._known[1] is None:
+                self._fitting.submit(self._fitted, None)
             self._known = learnt
             await self.tell_all(self.state())
 
@@ -233,17 +238,22 @@ class Live:
         if number < self._wanted:
             return
         fit, self._saved = None, ""
-        try:
-            if self.album.names():
-                fit = self.album.calibrate().evidence
+        if self.album.names():
+            fit = self._fitted(self.album)
+            if isinstance(fit, Failure):
+                words = fit.error if isinstance(fit.error, CalibError) else "the calibration broke off"
+                fit, self._saved = None, f"not saved: {words}"
+            else:
                 self._saved = str(self.album.rig)
-        except CalibError as error:
-            self._saved = f"not saved: {error}"
         rig = Rig.load(self.album.rig, missing_ok=True)
         with self._lock:
             self.session.fitted(fit)
             self.rig = rig
         self._fits = number
+
+    def _fitted(self, album: Album | None) -> Any:
+        """What `fit_of` returns in the process for fits, or a `Failure`."""
+        return next(result for _, result in run_tasks(self._process, [Task("fit", fit_of, (album,))]))
 
     async def pump(self) -> None:
         """Take frames from a source of this machine until it is over."""
@@ -587,6 +597,7 @@ class Live:
                 self.source.close()
             self._looking.shutdown(cancel_futures=True)
             self._fitting.shutdown()
+            self._process.__exit__()
             listener.close()
             sys.setswitchinterval(usual)
 

@@ -29,7 +29,7 @@ from calib.stages.camera.checks import (
     image_outline,
     tilted,
 )
-from calib.stages.camera.corners import Detection, detect, find_size, reduced, resized
+from calib.stages.camera.corners import detect, find_size, follow, reduced, resized
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lattice import find_lattices, find_saddles
 from calib.stages.camera.model import Board, Camera, View, pack, project
@@ -131,6 +131,7 @@ class Session:
     history: list[Progress] = field(default_factory=list)
     _plan: Plan | None = None
     _past: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=60))
+    _before: FloatArray | None = None
     _waits: bool = False
     _sized: tuple[int, int] | None = None
     _asked: tuple[float, float] | None = None
@@ -191,18 +192,20 @@ class Session:
             return Seen(None, "size", _other_size(size_px, self.size_px))
         self.size_px = size_px
         small = _reduced(gray)
-        board = None if self.corners is None else detect(small, *self.corners, quick=True)
+        board = None if self._before is None else follow(small, self._before)
+        if board is None and self.corners is not None:
+            board = _grid(small, self.corners)
         # Until a picture is taken: a hand on the board makes it look smaller.
         if board is None and not self._size_settled and (size := _size_of(small)):
             self.corners = self._sized = size
-            board = detect(small, *size, quick=True)
+            board = _grid(small, size)
+        self._before = board
         if self.corners is None:
             return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
         if board is None:
             return Seen(None, "no board", self._sought())
         scale = size_px[0] / small.shape[1]
-        grid = (board.pixels.reshape(self.corners[1], self.corners[0], 2) + 0.5) * scale - 0.5
-        return grid, self._fault(small, board, scale)
+        return (board + 0.5) * scale - 0.5, self._fault(small, board, scale)
 
     @property
     def _size_settled(self) -> bool:
@@ -244,26 +247,26 @@ class Session:
         long = t_s - self._past[0][0] >= _STILL_S
         return long and all(_apart(grid, one) < _STILL_SHARE * width for _, one in self._past)
 
-    def _fault(self, gray: GrayImage, found: Detection, scale: float) -> tuple[Code, str] | None:
+    def _fault(self, gray: GrayImage, grid: FloatArray, scale: float) -> tuple[Code, str] | None:
         """Why a picture is not worth taking."""
-        if found.contrast < _CONTRAST:
+        blur_px, contrast = edges(gray, grid)
+        if contrast < _CONTRAST:
             return "dark", "Too dark: more light on the board."
         width, height = self._size()
-        grid = found.pixels.reshape(found.rows, found.columns, 2)
-        if np.linalg.norm(np.ptp(found.pixels, axis=0)) * scale < _SMALL_SHARE * np.hypot(width, height):
+        if np.linalg.norm(np.ptp(grid, axis=(0, 1))) * scale < _SMALL_SHARE * np.hypot(width, height):
             return "small", "Too far away: bring the board closer."
-        if edge_blur_px(gray, grid) * scale > max(_BLUR_SHARE * width, _LEAST_BLUR_PX * scale):
+        if blur_px * scale > max(_BLUR_SHARE * width, _LEAST_BLUR_PX * scale):
             return "blurred", "Blurred: hold still, or focus."
         return None
 
     def _alike(self, grid: FloatArray) -> str | None:
         """Name of an earlier picture that shows the board in the same place."""
         limit = _ALIKE_SHARE * self._size()[0]
-        turned = grid[::-1, ::-1]
+        turns = [turned for k in range(4) if (turned := np.rot90(grid, k)).shape == grid.shape]
         for name, view in self.views.items():
             if view.pixels.size == grid.size:
                 other = view.pixels.reshape(grid.shape)
-                if min(_apart(grid, other), _apart(turned, other)) < limit:
+                if min(_apart(turned, other) for turned in turns) < limit:
                     return name
         return None
 
@@ -287,7 +290,7 @@ class Session:
         if found is None:
             return Seen(None, "no board", "Not taken: the board is not seen whole.")
         grid = found.pixels.reshape(found.rows, found.columns, 2)
-        fault = self._fault(gray, found, 1.0)
+        fault = self._fault(gray, grid, 1.0)
         if fault is not None and not by_hand:
             return Seen(grid, *fault)
         if not by_hand and (other := self._alike(grid)):
@@ -505,17 +508,17 @@ _START: tuple[tuple[str, tuple[float, float], str], ...] = (
 """Edge that leans away, and place in the picture, of the first poses."""
 
 
-def edge_blur_px(gray: GrayImage, grid: FloatArray) -> float:
-    """Standard deviation of the blur of a board's edges in pixels, in the worse of both directions.
+def edges(gray: GrayImage, grid: FloatArray) -> tuple[float, float]:
+    """Blur and contrast of a board's edges, in the worse of both directions.
 
-    An edge between neighbouring corners that is blurred by a Gaussian has the steepest slope
-    step / (sqrt(2 pi) sigma).
+    The blur is a standard deviation in pixels: an edge between neighbouring corners that is blurred by a
+    Gaussian has the steepest slope step / (sqrt(2 pi) sigma). The contrast is half the step, in grey levels.
 
     Parameters
     ----------
     grid : (rows, columns, 2) corners.
     """
-    worst = 0.0
+    blur_px, contrast = 0.0, np.inf
     for a, b in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
         along = (b - a).reshape(-1, 2)
         middle = (0.5 * (a + b)).reshape(-1, 2)
@@ -528,8 +531,15 @@ def edge_blur_px(gray: GrayImage, grid: FloatArray) -> float:
         # Over a pixel or more, so that noise and the sampling do not look steep.
         k = max(1, round(1.0 / (at[1] - at[0])))
         slope = np.abs(profile[:, k:] - profile[:, :-k]).max(axis=1) / (k * (at[1] - at[0]))
-        worst = max(worst, float(np.median(step / np.maximum(slope, 1e-9))) / float(np.sqrt(2 * np.pi)))
-    return worst
+        blur_px = max(blur_px, float(np.median(step / np.maximum(slope, 1e-9))) / float(np.sqrt(2 * np.pi)))
+        contrast = min(contrast, 0.5 * float(np.median(step)))
+    return blur_px, contrast
+
+
+def _grid(gray: GrayImage, corners: tuple[int, int]) -> FloatArray | None:
+    """Corners (rows, columns, 2) of a board of this size."""
+    found = detect(gray, *corners, quick=True)
+    return None if found is None else found.pixels.reshape(found.rows, found.columns, 2)
 
 
 def _size_of(gray: GrayImage) -> tuple[int, int] | None:

@@ -173,7 +173,7 @@ def kept_picture(name: str, folder: Path) -> Embedded | None:
 MOST_BYTES = 2_000_000
 """A page is never larger, the charts' library not counted; figures that do not fit are named instead."""
 _VIEWS_BYTES = 1_000_000
-_ROOM_BYTES = 450_000
+_ROOM_BYTES = 500_000
 """What is kept for words, tables and numbers."""
 _MOST_COUNTED = 3
 """Figures of one kind for each log that a stage shows, so that there is room for the states of all logs."""

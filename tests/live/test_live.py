@@ -38,7 +38,7 @@ from calib.io.serial import Frame, Inputs, Outputs
 from calib.live.album import Album
 from calib.live.marker import Marker
 from calib.live.server import MOST_BYTES, Live
-from calib.live.session import ENOUGH, Seen, Session, edge_blur_px
+from calib.live.session import ENOUGH, Seen, Session, edges
 from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
 from calib.stages.camera.intrinsics import calibrate_camera
@@ -47,7 +47,8 @@ from calib.stages.camera.options import Told
 from calib.stages.camera.read import BoardFile
 from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
-PICTURE_S = 30.0
+PATIENCE_S = 300.0
+"""Each wait ends with what it waits for; on a busy machine that may be late."""
 
 
 def session() -> Session:
@@ -211,19 +212,34 @@ def test_the_blur_of_edges_is_measured() -> None:
     for blur_px in (1.0, 2.0, 3.0):
         sensor = Sensor(blur_px=blur_px, noise_grey=1.0)
         gray = render(CAMERA, PrintedBoard(BOARD), pose, sensor=sensor, background=0.35)
-        assert edge_blur_px(gray, grid) == pytest.approx(np.hypot(blur_px, 0.29), rel=0.2)
+        assert edges(gray, grid)[0] == pytest.approx(np.hypot(blur_px, 0.29), rel=0.2)
 
 
-def test_a_frame_is_looked_at_within_150_ms() -> None:
-    pose = pose_facing(CAMERA, PrintedBoard(BOARD), (160.0, 120.0), 0.45, 0.5, 0.5)
-    gray = cv2.resize(Person(np.random.default_rng(0)).frame(pose), (640, 480))
-    live = Session(corners=(BOARD.columns, BOARD.rows))
+def test_a_board_that_moves_is_followed_in_a_fraction_of_the_time_that_finding_it_takes() -> None:
+    """As near to the corners as a drawing shows, and no part of it is taken for the whole."""
+    person, live = Person(np.random.default_rng(0)), Session(corners=(BOARD.columns, BOARD.rows))
     spent = []
-    for k in range(8):
-        began = time.perf_counter()
-        assert live.look(gray, 0.1 * k).corners_px is not None
-        spent.append(time.perf_counter() - began)
-    assert np.median(spent) < 0.15
+    for k in range(16):
+        middle = (150.0 + 2.5 * k, 130.0 - 2.0 * k)
+        pose = pose_facing(CAMERA, PrintedBoard(BOARD), middle, 0.4, 0.5 - 0.03 * k, 0.5 + 0.1 * k)
+        gray = cv2.resize(person.frame(pose), (640, 480))
+        began = time.process_time()
+        seen = live.look(gray, 0.1 * k)
+        spent.append(time.process_time() - began)
+        assert seen.corners_px is not None
+        truth = 2.0 * corner_pixels(CAMERA, PrintedBoard(BOARD), pose).reshape(seen.corners_px.shape) + 0.5
+        off = min(np.abs(seen.corners_px - turn).max() for turn in (truth, truth[::-1, ::-1]))
+        assert off < 0.5, k
+        # What `look` begins with, each time anew.
+        live._before = live._before if k % 4 else None
+    found, followed = np.median(spent[1::4]), np.median(spent[2::4] + spent[3::4])
+    print(f"CPU time of a frame of 640x480: {1e3 * found:.0f} ms to find, {1e3 * followed:.0f} ms to follow")
+    assert followed < 0.4 * found and followed < 0.05
+    inner = np.sort(seen.corners_px[..., 0].mean(axis=0))
+    for out in (inner[1] - 20.0, inner[0] + 3.0):
+        cut = np.ascontiguousarray(np.pad(gray[:, int(out) :], ((0, 0), (0, int(out))), "edge"))
+        assert live.look(cut, 2.0).corners_px is None
+        assert live.look(gray, 2.1).corners_px is not None
 
 
 # ----------------------------------------------------------------------
@@ -378,13 +394,13 @@ def served(folder: Path, source: Source | None = None, port: str | None = None) 
     thread = threading.Thread(target=live.serve, args=(tell,))
     thread.start()
     try:
-        assert ready.wait(PICTURE_S)
+        assert ready.wait(PATIENCE_S)
         wait(lambda: answers(address[0]))
         live.address = address[0]  # type: ignore[attr-defined]  # for the test alone
         yield live
     finally:
         live.finished.set()
-        thread.join(PICTURE_S)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -394,8 +410,8 @@ def answers(address: str) -> bool:
     return False
 
 
-def wait(true: Callable[[], Any], most_s: float = PICTURE_S) -> None:
-    end = time.monotonic() + most_s
+def wait(true: Callable[[], Any]) -> None:
+    end = time.monotonic() + PATIENCE_S
     while not true():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.05)
@@ -405,7 +421,7 @@ def ask(
     address: str, path: str = "", method: str = "GET", **headers: str
 ) -> tuple[int, dict[str, str], bytes]:
     url = urlsplit(address)
-    line = http.client.HTTPConnection("127.0.0.1", url.port, timeout=PICTURE_S)
+    line = http.client.HTTPConnection("127.0.0.1", url.port, timeout=PATIENCE_S)
     try:
         host = headers.pop("host", url.netloc)
         line.request(method, path or url.path, headers={"Host": host, **headers})
@@ -423,7 +439,7 @@ def tab(live: Any, **more: Any) -> ClientConnection:
 
 def heard(line: ClientConnection, kind: str) -> dict[str, Any]:
     while True:
-        got = line.recv(timeout=PICTURE_S)
+        got = line.recv(timeout=PATIENCE_S)
         if isinstance(got, str) and (message := json.loads(got))["type"] == kind:
             return dict(message)
 
@@ -518,7 +534,7 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
         heard(second, "free")
         with contextlib.suppress(Exception):
             line.send(b"\xff\xd8" + bytes(MOST_BYTES))
-            line.recv(timeout=PICTURE_S)
+            line.recv(timeout=PATIENCE_S)
         second.send('{"do": "done"}')
         assert heard(second, "done")["folder"] == str(live.album.folder)
     assert MOST_PIXELS * 3 > MOST_BYTES
@@ -713,8 +729,9 @@ def test_a_board_is_recorded_from_the_page(tmp_path: Path) -> None:
 def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
     """A fake camera shows the board where a session asks for it; the page, reloaded, knows everything."""
     person = Person(np.random.default_rng(0))
-    poses = follow_some(person, 6)
-    write_y4m(tmp_path / "board.y4m", [person.frame(pose) for pose in poses])
+    # More than a verdict needs: which of them are taken depends on the pace.
+    poses = follow_some(person, 12)
+    write_y4m(tmp_path / "board.y4m", [person.frame(pose) for pose in poses], frames_each=30)
     switches = (
         "--use-fake-ui-for-media-stream",
         "--use-fake-device-for-media-stream",
@@ -727,14 +744,21 @@ def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
             browser.open(live.address, 1200, 1000)
             wait(lambda: "Press c" in browser.run("document.getElementById('says').textContent"))
             browser.key("c", 67, "c")
-            wait(lambda: live.state()["verdict"] == "ok" and not live.state()["fitting"], 60.0)
+            wait(lambda: live.state()["verdict"] == "ok" and not live.state()["fitting"])
+            told = (
+                "frame to corners: {:.0f} ms, 95 of 100 within {:.0f} ms, pictures taken and fitted meanwhile"
+            )
+            print(told.format(*np.percentile(browser.run("delays"), (50, 95))))
             browser.key("a", 65, "a")
             wait(lambda: not live.auto and not live.state()["fitting"])
             # An answer stays while frames go on telling what they show.
             browser.run("send({do: 'colour', name: 'gold-ish'})")
             wait(lambda: "no colour" in browser.run("document.getElementById('says').textContent"))
-            time.sleep(2.0)
-            assert "no colour" in browser.run("document.getElementById('says').textContent")
+            answered = browser.run("frames")
+            while (told := browser.run("[stays - performance.now(), frames, $('says').textContent]"))[0] > 0:
+                assert "no colour" in told[2]
+                if told[1] > answered + 10:
+                    break
             browser.run("video.pause()")
             wait(lambda: "no new pictures" in browser.run("document.getElementById('says').textContent"))
             browser.run("video.play()")
@@ -755,7 +779,7 @@ def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
             assert browser.run("document.documentElement.scrollWidth") == 390
             assert not browser.run("document.getElementById('auto').checked")
             browser.key("d", 68, "d")
-            assert live.finished.wait(PICTURE_S)
+            assert live.finished.wait(PATIENCE_S)
             wait(lambda: "Done. Saved" in browser.run("document.getElementById('says').textContent"))
             assert browser.errors == []
         finally:

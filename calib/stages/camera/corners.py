@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calib.core.arrays import AnyArray, BoolArray, FloatArray, GrayImage
+from calib.core.arrays import AnyArray, BoolArray, FloatArray, GrayImage, rms
 from calib.stages.camera.lattice import (
     Lattice,
     checkered,
@@ -594,4 +594,40 @@ def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Det
         grid = _best_of(gray, grids)
         if grid is not None:
             return _ordered(grid, columns, rows)
+    return None
+
+
+_FOLLOWED_SHARE = 1.0
+"""How far a board may go from one picture to the next, over its longer side, to be taken for the same."""
+
+
+def follow(gray: GrayImage, before_px: FloatArray) -> FloatArray | None:
+    """Corners (rows, columns, 2) of a board that was detected a moment ago, to some tenths of a pixel.
+
+    They are the saddle points of the brightness, in a fifth of the time that `detect` takes, which measures
+    each corner and its surroundings.
+
+    Parameters
+    ----------
+    gray : (H, W) of uint8. before_px : (rows, columns, 2) where the board was.
+
+    Returns
+    -------
+    None where not every corner is seen, or where the board went too far: `detect` may find it then. The
+    order is the one that is nearest to the order before.
+    """
+    rows, columns = before_px.shape[:2]
+    side = np.linalg.norm([before_px[0, -1] - before_px[0, 0], before_px[-1, 0] - before_px[0, 0]], axis=1)
+    for zoom in lattice_levels(gray):
+        if zoom > 1.0:
+            break
+        level = resized(gray, zoom)
+        for lattice in find_lattices(find_saddles(level.image), least=columns * rows):
+            points = level.to_picture(lattice.points)
+            turns = [t for k in range(4) if (t := np.rot90(points, k)).shape == before_px.shape]
+            if lattice.seen.all() and turns:
+                away = [rms(np.linalg.norm(turn - before_px, axis=-1)) for turn in turns]
+                k = int(np.argmin(away))
+                if away[k] < _FOLLOWED_SHARE * side.max():
+                    return np.ascontiguousarray(turns[k])
     return None
