@@ -12,8 +12,9 @@
  * Before including, or as flags: CALIB_IMU_MPU6050 1 for that IMU instead of the BNO055, CALIB_PIXY2_I2C 1 for the
  * camera on I2C instead of SPI, CALIB_I2C_HZ.
  *
- * A loop that does not come round, as on a bus that hangs, is stopped by the watchdog: pumps off within 125 ms, then
- * a reset. A sensor that does not answer, or is not what it should be, is started anew, ever more seldom.
+ * A loop that does not come round, as on a bus that hangs, is stopped by the watchdog: pumps off within 62 ms (125 ms
+ * where a tick takes more than 25 ms), then a reset. A sensor that does not answer, or is not what it should be, is
+ * started anew, ever more seldom.
  */
 #define CALIB_PROGMEM 1
 #define CALIB_EXPECT_SCHEMA 7
@@ -35,6 +36,9 @@
 #endif
 #include "calib_pixy2.h"
 
+#if CALIB_TICK_RATE_MHZ < 16000 || CALIB_TICK_RATE_MHZ > 110000
+#error "calib: this sketch ticks 16 to 110 times a second: the watchdog bears no longer, the serial port no more"
+#endif
 #ifndef CALIB_EXAMPLE_MODE
 #define CALIB_EXAMPLE_MODE CALIB_MODE_OFF
 #endif
@@ -55,7 +59,7 @@ static uint32_t next_us, sample_us, imu_us;
 static uint8_t sampling, overruns;
 static float force[3], rate[3];
 
-/* Why the watchdog stopped the loop: kept over its reset and told in every frame, until the supply goes. */
+/* Why the pumps were stopped last: kept over a reset and told in every frame, until a person clears it or the supply goes. */
 #define CHECK_OF(fault) ((uint16_t)(0xC5A0u ^ (uint16_t)((fault) * 257u)))
 #if defined(__AVR__)
 static uint8_t kept_fault __attribute__((section(".noinit")));
@@ -68,19 +72,23 @@ void calib_early(void) {
     wdt_disable();
 }
 
-/* The loop did not come round: pumps off. The next time-out is a reset. */
+static void keep(uint8_t fault) {
+    kept_fault = fault;
+    kept_check = CHECK_OF(fault);
+}
+
+/* The loop did not come round: pumps off. The next time-out is a reset, also where interrupts are off. */
 ISR(WDT_vect) {
     digitalWrite(PUMP_PINS[0], LOW);
     digitalWrite(PUMP_PINS[1], LOW);
-    kept_fault = CALIB_FAULT_WATCHDOG;
-    kept_check = CHECK_OF(CALIB_FAULT_WATCHDOG);
+    keep(CALIB_FAULT_WATCHDOG);
 }
 
 static void watch(void) {
     cli();
     wdt_reset();
     WDTCSR = (uint8_t)(_BV(WDCE) | _BV(WDE));
-    WDTCSR = (uint8_t)(_BV(WDIE) | _BV(WDE) | WDTO_120MS);
+    WDTCSR = (uint8_t)(_BV(WDIE) | _BV(WDE) | (TICK_US > 25000 ? WDTO_120MS : WDTO_60MS));
     sei();
 }
 
@@ -98,10 +106,13 @@ static void recall(void) {
 #elif defined(ARDUINO_ARCH_NRF52840) || defined(NRF52840_XXAA)
 /* Nano 33 BLE: its watchdog resets at once, which makes the pins inputs; the resistors to ground hold the pumps off. */
 #define REGISTER(at) (*(volatile uint32_t *)(at))
-static uint8_t kept_fault;
+static uint8_t kept_fault; /* not over a reset, but for the watchdog's */
+static void keep(uint8_t fault) {
+    kept_fault = fault;
+}
 static void watch(void) {
     REGISTER(0x4001050CUL) = 1u;    /* also while the processor sleeps */
-    REGISTER(0x40010504UL) = 4095u; /* 125 ms at 32,768 Hz */
+    REGISTER(0x40010504UL) = TICK_US > 25000 ? 4095u : 2047u; /* 125 or 62 ms at 32,768 Hz */
     REGISTER(0x40010508UL) = 1u;
     REGISTER(0x40010000UL) = 1u;
 }
@@ -118,7 +129,10 @@ static void recall(void) {
 #if !defined(CALIB_NO_WATCHDOG)
 #error "calib: no watchdog is known for this board; write watch() and watched(), or CALIB_NO_WATCHDOG 1 does without"
 #endif
-static uint8_t kept_fault;
+static uint8_t kept_fault; /* not over a reset */
+static void keep(uint8_t fault) {
+    kept_fault = fault;
+}
 static void watch(void) {}
 static void watched(void) {}
 static void recall(void) {}
@@ -175,8 +189,9 @@ static bool read_imu(void) {
     }
     if (imu_measures()) {
         imu_failed = came ? 0 : (uint8_t)(imu_failed + 1u);
-        if (imu_failed >= CALIB_GUARD_SAME || guard.imu_same >= CALIB_GUARD_SAME) {
-            guard.imu_same = 0;
+        if (imu_failed >= CALIB_GUARD_SAME || calib_guard_frozen(&guard)) {
+            guard.rate_same = 0;
+            guard.force_same = 0;
             imu_again();
         }
     }
@@ -260,9 +275,14 @@ static void listen(void) {
     if (link.clear) {
         link.clear = 0;
         calib_guard_clear(&guard);
+        keep(CALIB_FAULT_NONE);
     }
-    if (calib_link_silent(&link, millis()) && guard.state == CALIB_RUN && (sampling || CALIB_EXAMPLE_HEARTBEAT)) {
-        calib_guard_fault(&guard, CALIB_FAULT_HOST);
+    if (calib_link_silent(&link, millis()) && (sampling || CALIB_EXAMPLE_HEARTBEAT)) {
+        if (guard.state == CALIB_RUN) {
+            calib_guard_fault(&guard, CALIB_FAULT_HOST);
+        }
+        /* Nothing begins either. */
+        guard.quiet = 0;
     }
     if (link.samples != sampling) {
         sampling = link.samples;
@@ -365,6 +385,9 @@ void loop() {
         out.duty[1] = link.duty[1];
     }
     calib_guard_tick(&guard, &state, &in, &out);
+    if (guard.fault != CALIB_FAULT_NONE && guard.fault != CALIB_FAULT_REFERENCE) {
+        keep(guard.fault);
+    }
     analogWrite(PUMP_PINS[0], out.duty[0]);
     analogWrite(PUMP_PINS[1], out.duty[1]);
     if (!sampling) {

@@ -125,12 +125,12 @@ def _estimator(delay_s: float) -> dict[str, Any]:
     return {"jitter_px": 0.3, "constant_gain": _gain(delay_s), "verdict": "ok"}
 
 
-def _lowpass(family: str = "butterworth") -> dict[str, Any]:
-    made = design_lowpass(Design(2.0, 60.0, 3, family))
+def _lowpass(family: str = "butterworth", order: int = 3) -> dict[str, Any]:
+    made = design_lowpass(Design(2.0, 60.0, order, family))
     rows = made.sections.tolist()
     return {
         "family": family,
-        "order": 3,
+        "order": order,
         "cutoff_hz": 2.0,
         "rate_hz": 60.0,
         "sections": [{"b": row[:3], "a": row[3:]} for row in rows],
@@ -147,7 +147,8 @@ def _lowpass(family: str = "butterworth") -> dict[str, Any]:
 def rig(kind: str = "nominal") -> Rig:
     """A rig with camera and plane; "full" with every section, "levelling" the same with that angle filter.
 
-    "fisheye" has a lens of 110 degrees, and an elliptic low-pass. "fused" has what that estimator needs,
+    "fisheye" has a lens of 110 degrees, and an elliptic low-pass. "plain" has no lens, and a low-pass of
+    order 8. "fused" has what that estimator needs,
     "twin" the same with the sensors of the nominal simulated rig.
     """
     camera = _camera()
@@ -156,6 +157,11 @@ def rig(kind: str = "nominal") -> Rig:
         lens = {"k1": 0.03, "k2": -0.01, "k3": 0.004, "k4": -0.001}
         camera = _camera(model="fisheye4", distortion=lens, fx_px=164.0, fy_px=164.5)
         sections = {"camera": camera, "plane": _plane(camera), "lowpass": _lowpass("elliptic")}
+    if kind == "plain":
+        camera, control = _camera(model="pinhole", distortion={}), _controller()
+        control["orientation"]["sign"] = -1
+        sections = {"camera": camera, "plane": _plane(camera), "lowpass": _lowpass("elliptic", 8)}
+        sections["controller"] = control
     if kind == "fused":
         sections |= {"align": {**_align(), "time_offset_s": 0.025}, "estimator": _estimator(0.025)}
     if kind == "twin":

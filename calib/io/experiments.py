@@ -120,6 +120,8 @@ def experiment(name: str) -> Experiment:
 # The board, and one experiment with it.
 
 _PERIOD_S, _LEAST_S = 0.04, 0.012
+_RESTARTS_S = 3.0
+"""A bootloader waits for a second or two before a board that restarted says so."""
 _ANSWER_S = 12.0
 """A usual board restarts when its port is opened, and computes its self-test."""
 
@@ -266,7 +268,7 @@ def _recorded(
                 raise BadInputError(
                     f"{board.name}: the board restarted after {rows.time_s:.1f} s{why}; record this again"
                 )
-            if now - heard_s > 1.0:
+            if now - heard_s > _RESTARTS_S:
                 raise BadInputError(
                     f"{board.name}: the board fell silent after {rows.time_s:.1f} s; record this again"
                 )

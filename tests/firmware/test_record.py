@@ -22,7 +22,7 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.experiments import EXPERIMENTS, PROGRAMME, Board, Done, Experiment, experiment, perform
 from calib.io.logs import read_log
-from calib.io.serial import GUARD_FAULT, GUARD_RUN, Decoder, Frame, setting
+from calib.io.serial import ALIVE, CLEAR, GUARD_FAULT, GUARD_RUN, Decoder, Frame, setting
 from calib.stages.firmware.header import header_of
 
 SILENT_MS = 284.0
@@ -147,6 +147,47 @@ def test_a_command_beyond_the_envelope_drives_nothing(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="a pump was on for too long in open loop"):
         _do(simulated, replace(EXPERIMENTS["steps"], seconds=3.0), tmp_path / "log.csv")
     assert simulated.duty == (0, 0)
+    # The last fault is told after a reset, until a person has looked.
+    for kept in (21, 0):
+        simulated.everything()
+        simulated.reset()
+        assert Board(simulated, "board").hello.kept == kept
+        # The first may be taken for the rest of a frame that the full buffer of a board that starts has cut.
+        simulated.write(CLEAR + CLEAR)
+        simulated.run(0.1)
+
+
+def test_without_a_computer_that_it_needs_nothing_begins(tmp_path: Path) -> None:
+    simulated = SimulatedBoard(sketch(tmp_path, "POSITION", "-DCALIB_EXAMPLE_HEARTBEAT=1"), 25.0)
+    for _ in range(300):
+        simulated.run(0.04)
+        assert simulated.duty == (0, 0)
+    on, decoder, faults = [], Decoder(), set()
+    for alive in (True, False, True):
+        for _ in range(50):
+            simulated.run(0.04)
+            for one in decoder.feed(simulated.everything()):
+                faults |= {one.guard.fault} if isinstance(one, Frame) and one.guard is not None else set()
+            if alive:
+                simulated.write(ALIVE)
+            on.append(max(simulated.duty) > 0)
+    # After half a second, and after a silence in between after a whole one: the one at first was no fault.
+    assert all(on[25:50]) and not any(on[60:100]) and all(on[135:])
+    assert faults == {0, 8}
+
+
+def test_a_computer_that_clears_every_fault_at_once_does_not_keep_a_pump_at_full_power(
+    tmp_path: Path,
+) -> None:
+    simulated = SimulatedBoard(sketch(tmp_path, "OFF"), 30.0)
+    on = []
+    for _ in range(1000):
+        simulated.write(CLEAR + setting(True, (255, 255)))
+        simulated.run(0.02)
+        on.append(max(simulated.duty) == 255)
+    assert sum(on[:400]) > 100
+    # 3 s of envelope.full_power_s once, then no longer than off.
+    assert sum(on[500:]) <= 260
 
 
 def test_a_board_that_restarts_ends_the_recording(bare: Built, tmp_path: Path) -> None:

@@ -11,8 +11,16 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
+from calib.stages.actuator.kinematics import inverse
 from calib.stages.estimator.sensors import GRAVITY_MPS2
-from calib.stages.firmware.conformance import MARKER_HELD, Reference, binary32, reference_of, sinc
+from calib.stages.firmware.conformance import (
+    MARKER_HELD,
+    REFERENCE_LIMIT,
+    Reference,
+    binary32,
+    reference_of,
+    sinc,
+)
 
 # ----------------------------------------------------------------------
 # Golden vectors: a short run that drives every constant, with what the reference makes of it.
@@ -181,7 +189,9 @@ def vectors(
     if limits:
         silent = replace(still, marker_seen=False, imu_read=False)
         weightless = binary32(replace(silent, imu_read=True, ax_mps2=0.1, ay_mps2=-0.1))
-        given = [(silent, 1), (weightless, 1), *given, *_limits(constants, still)]
+        # The angle is known before the first picture.
+        unseen = replace(run[0], marker_seen=False)
+        given = [(silent, 1), (weightless, 1), (unseen, 1), *given, *_limits(constants, still)]
         if fused:
             given += _bent(constants, coherent(constants, ticks, period=ticks))
     made = []
@@ -209,6 +219,21 @@ def _row(vector: Vector) -> list[float]:
     return [float(v) if abs(v) > 1e-30 else 0.0 for v in row]
 
 
+def _points(constants: Mapping[str, float]) -> list[list[float]]:
+    """Points in front of the base with the lengths that bring the head there, and what is refused."""
+    rest, radius, refused = (
+        constants["CALIB_REST_LENGTH_M"],
+        constants["CALIB_BELLOWS_RADIUS_M"],
+        2.0 * REFERENCE_LIMIT,
+    )
+    rows = []
+    for share in (1.0, -0.6, 0.3):
+        x = float(np.float32(share * rest))
+        rows.append([x, rest, *inverse(np.array([x, rest, 2.0 * math.atan2(x, rest)]), radius).tolist()])
+    beyond = ((1.01 * rest, rest), (0.0, -rest), (0.0, 6.31), (0.0, _NAN))
+    return rows + [[x, y, refused, refused] for x, y in beyond]
+
+
 def _words(made: list[Vector]) -> list[int]:
     """What came with the inputs, mode and repetitions, and flags, two for each tick."""
     words = [
@@ -222,6 +247,7 @@ def selftest_rows(constants: Mapping[str, float]) -> dict[str, Any]:
     fused = vectors(constants, FUSED_TICKS, fused=True, limits=True) if constants["CALIB_HAS_FUSED"] else []
     plain = vectors(constants, limits=True)
     return {
+        "points": _points(constants),
         "undistort": int(constants["CALIB_HAS_PLANE"] and Reference(constants).undistort),
         "rows": list(map(_row, plain)),
         "fused_rows": list(map(_row, fused)),

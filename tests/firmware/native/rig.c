@@ -35,6 +35,8 @@
 #define OCR1BL 0x8A
 #define PORTB 0x25
 #define TWCR 0xBC
+#define WDTCSR 0x60
+#define WDT_VECTOR 6
 #define TWI_VECTOR 24
 
 static avr_t *avr;
@@ -79,6 +81,14 @@ static void put(unsigned where, double value) {
     reply[where + 1] = (unsigned char)(whole >> 8 & 255);
 }
 
+static avr_int_vector_t *vector_of(unsigned number) {
+    unsigned i = 0;
+    while (i + 1u < avr->interrupts.vector_count && avr->interrupts.vector[i]->vector != number) {
+        i++;
+    }
+    return avr->interrupts.vector[i];
+}
+
 static double angle(void) {
     double turned = 0.04 * (length[0] - length[1]) / (2 * 0.0126);
     return is("marker_frozen") ? turned + 0.6 * sin(0.003 * (now_ms() - at_ms)) : turned;
@@ -115,9 +125,11 @@ static void axes(int *force, int *rate) {
             now[i] = (int16_t)now[i];
         }
     }
-    /* Its readings stand still; its registers answer. */
-    if (!is("imu_frozen")) {
-        memcpy(kept, now, sizeof kept);
+    /* Readings stand still, all or those of one sensor; registers answer. */
+    for (i = 0; i < 6; i++) {
+        if (!is("imu_frozen") && !is(i < 3 ? "force_frozen" : "rate_frozen")) {
+            kept[i] = now[i];
+        }
     }
     memcpy(force, kept, 3 * sizeof *force);
     memcpy(rate, kept + 3, 3 * sizeof *rate);
@@ -394,21 +406,19 @@ static int was_on;
 
 /* Let the board and its rig go on to a time; whether the processor stopped. */
 static int go_on(double end_ms) {
-    static double next_ms, last_ms;
+    static double next_ms, last_ms, waits_since;
     static int done;
     while (now_ms() < end_ms) {
         avr_cycle_count_t before = avr->cycle;
         int state;
         if (is("bus_hang") && avr->interrupts.vector[0] != NULL) {
             /* A line that is held: no byte ever ends. */
-            unsigned i;
-            for (i = 0; i < avr->interrupts.vector_count; i++) {
-                avr_int_vector_t *vector = avr->interrupts.vector[i];
-                if (vector->vector == TWI_VECTOR) {
-                    avr_clear_interrupt(avr, vector);
-                }
-            }
+            avr_clear_interrupt(avr, vector_of(TWI_VECTOR));
             avr->data[TWCR] &= 0x7F;
+        }
+        if (is("stop_hang")) {
+            /* The core waits for the stop in its interrupt, where no other comes. */
+            avr->data[TWCR] |= 0x10;
         }
         state = avr_run(avr);
         if (state == cpu_Done || state == cpu_Crashed) {
@@ -417,7 +427,17 @@ static int go_on(double end_ms) {
         if (avr->cycle < before) {
             resets++;
         }
+        if (!vector_of(WDT_VECTOR)->pending) {
+            waits_since = now_ms();
+        } else if (now_ms() - waits_since > (double)(16 << (avr->data[WDTCSR] & 7))) {
+            /* The data sheet's 10.9.2, which simavr lacks: a time-out while the last one still waits is a reset. */
+            avr_reset(avr);
+            resets++;
+        }
         if (!done && now_ms() >= at_ms) {
+            if (strcmp(fault, "imu_page") == 0) {
+                registers[0x07] = 1;
+            }
             if (strcmp(fault, "imu_brown_out") == 0 || strcmp(fault, "supply_reset") == 0) {
                 restart_imu();
             }
@@ -437,7 +457,7 @@ static int go_on(double end_ms) {
             double step = now_ms() - last_ms;
             int i, on = pump(0) || pump(1);
             for (i = 0; i < 2; i++) {
-                double goes_to = is("stuck") ? length[i] : pow((double)pump(i) / 255, 2);
+                double goes_to = is("stuck") ? length[i] : pow((double)pump(is("swapped") ? 1 - i : i) / 255, 2);
                 length[i] += (goes_to - length[i]) * step / 300;
             }
             if (now_ms() < at_ms) {

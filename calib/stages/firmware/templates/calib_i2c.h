@@ -10,6 +10,16 @@
 #ifndef CALIB_I2C_HZ
 #define CALIB_I2C_HZ 400000
 #endif
+/* What a byte may take on a bus that hangs; 0: for ever, where the watchdog ends it. */
+#ifndef CALIB_I2C_LIMIT_US
+#define CALIB_I2C_LIMIT_US 3000
+#endif
+
+/* Where the core can break off. No macro tells: Arduino's cores have the function, but not WIRE_HAS_TIMEOUT. */
+template <typename Bus> static auto calib_i2c_limit(Bus *bus, uint32_t us) -> decltype(bus->setWireTimeout(us, true)) {
+    bus->setWireTimeout(us, true);
+}
+static inline void calib_i2c_limit(void *, uint32_t) {}
 
 /* A slave that holds the data line lets it go after nine clocks. */
 static void calib_i2c_start(void) {
@@ -27,9 +37,7 @@ static void calib_i2c_start(void) {
 #endif
     Wire.begin();
     Wire.setClock(CALIB_I2C_HZ);
-#if defined(WIRE_HAS_TIMEOUT)
-    Wire.setWireTimeout(3000, true);
-#endif
+    calib_i2c_limit(&Wire, CALIB_I2C_LIMIT_US);
 }
 
 static bool calib_i2c_write(uint8_t address, uint8_t place, uint8_t value) {

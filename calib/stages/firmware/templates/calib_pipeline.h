@@ -513,55 +513,41 @@ static inline uint16_t calib_marker(calib_state *state, const calib_inputs *in, 
 }
 
 #if !CALIB_FUSED
+#if CALIB_LOWPASS_PAIRS > 0
+/* One section of order two; Z is 0 for zeros at z = -1. */
+static inline float calib_lowpass_pair(float *s, float x, float A1, float A2, float A3, float Z) {
+    float v3 = x - s[1], v1 = A1 * s[0] + A2 * v3;
+    x = s[1] + (A2 * s[0] + A3 * v3);
+    s[1] = 2.0f * x - s[1];
+    if (CALIB_LOWPASS_ZEROS) {
+        x += Z * (v1 - s[0]);
+    }
+    s[0] = 2.0f * v1 - s[0];
+    return x;
+}
+#endif
+
 /* One tick of the low-pass of one coordinate; s is its memory. Exact at rest. */
 static inline float calib_lowpass(float *s, float x) {
 #if CALIB_LOWPASS_PAIRS > 0
-    {
-        float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR1_A1 * s[0] + CALIB_LOWPASS_PAIR1_A2 * v3;
-        x = s[1] + (CALIB_LOWPASS_PAIR1_A2 * s[0] + CALIB_LOWPASS_PAIR1_A3 * v3);
-        s[1] = 2.0f * x - s[1];
-#if CALIB_LOWPASS_ZEROS
-        x += CALIB_LOWPASS_PAIR1_Z * (v1 - s[0]);
-#endif
-        s[0] = 2.0f * v1 - s[0];
-        s += 2;
-    }
+    x = calib_lowpass_pair(s, x, CALIB_LOWPASS_PAIR1_A1, CALIB_LOWPASS_PAIR1_A2, CALIB_LOWPASS_PAIR1_A3,
+                           CALIB_LOWPASS_PAIR1_Z);
+    s += 2;
 #endif
 #if CALIB_LOWPASS_PAIRS > 1
-    {
-        float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR2_A1 * s[0] + CALIB_LOWPASS_PAIR2_A2 * v3;
-        x = s[1] + (CALIB_LOWPASS_PAIR2_A2 * s[0] + CALIB_LOWPASS_PAIR2_A3 * v3);
-        s[1] = 2.0f * x - s[1];
-#if CALIB_LOWPASS_ZEROS
-        x += CALIB_LOWPASS_PAIR2_Z * (v1 - s[0]);
-#endif
-        s[0] = 2.0f * v1 - s[0];
-        s += 2;
-    }
+    x = calib_lowpass_pair(s, x, CALIB_LOWPASS_PAIR2_A1, CALIB_LOWPASS_PAIR2_A2, CALIB_LOWPASS_PAIR2_A3,
+                           CALIB_LOWPASS_PAIR2_Z);
+    s += 2;
 #endif
 #if CALIB_LOWPASS_PAIRS > 2
-    {
-        float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR3_A1 * s[0] + CALIB_LOWPASS_PAIR3_A2 * v3;
-        x = s[1] + (CALIB_LOWPASS_PAIR3_A2 * s[0] + CALIB_LOWPASS_PAIR3_A3 * v3);
-        s[1] = 2.0f * x - s[1];
-#if CALIB_LOWPASS_ZEROS
-        x += CALIB_LOWPASS_PAIR3_Z * (v1 - s[0]);
-#endif
-        s[0] = 2.0f * v1 - s[0];
-        s += 2;
-    }
+    x = calib_lowpass_pair(s, x, CALIB_LOWPASS_PAIR3_A1, CALIB_LOWPASS_PAIR3_A2, CALIB_LOWPASS_PAIR3_A3,
+                           CALIB_LOWPASS_PAIR3_Z);
+    s += 2;
 #endif
 #if CALIB_LOWPASS_PAIRS > 3
-    {
-        float v3 = x - s[1], v1 = CALIB_LOWPASS_PAIR4_A1 * s[0] + CALIB_LOWPASS_PAIR4_A2 * v3;
-        x = s[1] + (CALIB_LOWPASS_PAIR4_A2 * s[0] + CALIB_LOWPASS_PAIR4_A3 * v3);
-        s[1] = 2.0f * x - s[1];
-#if CALIB_LOWPASS_ZEROS
-        x += CALIB_LOWPASS_PAIR4_Z * (v1 - s[0]);
-#endif
-        s[0] = 2.0f * v1 - s[0];
-        s += 2;
-    }
+    x = calib_lowpass_pair(s, x, CALIB_LOWPASS_PAIR4_A1, CALIB_LOWPASS_PAIR4_A2, CALIB_LOWPASS_PAIR4_A3,
+                           CALIB_LOWPASS_PAIR4_Z);
+    s += 2;
 #endif
 #if CALIB_LOWPASS_SINGLES > 0
     {
