@@ -24,7 +24,8 @@
  *   reference NaN or absurd               pumps off, controllers cleared     CALIB_BAD_REFERENCE
  *   command beyond the limits             saturated, anti-windup             CALIB_SATURATED_1, _2
  * With constants that have no plane no marker is ever seen.
- * A marker that comes back after CALIB_HOLD_TICKS starts the low-pass afresh. No output is ever NaN or infinite.
+ * A marker that comes back after CALIB_HOLD_TICKS starts the low-pass afresh, an IMU after half of them the levelling
+ * filter, which keeps the bias. No output is ever NaN or infinite.
  * With CALIB_FUSED 1 moreover
  *   no marker                             angle by the IMU, the length's rate decays
  *   marker far from the expected place    left out, after CALIB_FUSED_PATIENCE
@@ -366,6 +367,9 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     float ax, ay, gz, e = 0.0f, phi = state->phi_rad;
 #if CALIB_LEVELLING
     float turned = 0.0f;
+    uint8_t afresh = (uint8_t)(state->imu_age > CALIB_HOLD_TICKS / 2);
+#else
+    uint8_t afresh = (uint8_t)(state->imu_age == CALIB_NEVER);
 #endif
     uint16_t flags = 0;
     if (!calib_sampled(in)) {
@@ -375,8 +379,11 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     ay = CALIB_AY(in);
     gz = CALIB_GZ(in);
 #if CALIB_LEVELLING
-    if (state->imu_age != CALIB_NEVER) {
+    if (!afresh) {
         turned = state->integral_rad - (0.5f * CALIB_MM_DT_S) * (gz + state->before_radps);
+        if (state->imu_age > 0) {
+            turned *= (float)(state->imu_age + 1u); /* the ticks without a sample as well */
+        }
         phi += turned;
     }
     state->before_radps = gz;
@@ -385,7 +392,7 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
     ax = ax - CALIB_IMU_ACCEL_BIAS_X_MPS2;
     ay = (ay - CALIB_IMU_ACCEL_BIAS_Y_MPS2) * CALIB_IMU_ACCEL_RATIO;
     if (calib_within(ax, CALIB_IMU_ACCEL_WEAK_MPS2) && calib_within(ay, CALIB_IMU_ACCEL_WEAK_MPS2)) {
-        if (state->imu_age == CALIB_NEVER) {
+        if (afresh) {
             return (uint16_t)(CALIB_ACCEL_WEAK | calib_imu_lost(state));
         }
         flags = CALIB_ACCEL_WEAK;
@@ -395,8 +402,14 @@ static inline uint16_t calib_angle(calib_state *state, const calib_inputs *in) {
             e = calib_negative(e) ? e + 2.0f * CALIB_PI_F : e - 2.0f * CALIB_PI_F;
         }
     }
-    if (state->imu_age == CALIB_NEVER) {
-        phi = e;
+    if (afresh) {
+        phi += e;
+#if CALIB_LEVELLING
+        state->sum_rad = 0.0f;
+        state->rest_rad[0] = 0.0f;
+        state->ticks = 0;
+        state->step = 0;
+#endif
     } else {
 #if CALIB_LEVELLING
         uint8_t i = state->step;

@@ -3,8 +3,9 @@
 First the inclination's RMSE in motion of filters by others beside what was published, which shows that
 the evaluation is right; then the angle in the plane, in windows where the sensor's plane is near gravity;
 then VQF and the levelling filter on the recordings as others might have made them, after 5 s and with the
-truth's clock shifted by what suits each best. Last the recording of the folder imufusion, which has no
-truth: the largest angle to the mean force as the sensor comes to rest, once after circles.
+truth's clock shifted by what suits each best, and begun in motion with a bias of 5 deg/s. Last the
+recording of the folder imufusion, which has no truth: the largest angle to the mean force as the sensor
+comes to rest, once after circles.
 Recordings lie in the folder broad of CALIB_SHARED_DATA.
 """
 
@@ -23,6 +24,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from broad_trials import (
     FILES,
     PUBLISHED_DEG,
+    Trial,
     filter_rmse_deg,
     late_deg,
     read_trial,
@@ -75,6 +77,8 @@ def main() -> None:
             t = other.period_s * np.arange(len(other.gyro))
             own = level_three(Levelling(), t, other.force, other.gyro)
             print(f"    {words:38} {late_deg(other, peer_up):7.3f} {late_deg(other, own):7.3f}")
+        for (begin, end), (peer_deg, own_deg) in zip(SPANS_S, begun_deg(one).tolist(), strict=True):
+            print(f"    begun in motion, {begin:2} to {end:2} s            {peer_deg:7.2f} {own_deg:7.2f}")
     table = np.genfromtxt(folder.parent / "imufusion" / "sensor_data.csv", delimiter=",", skip_header=1)
     t = np.arange(table[0, 0], table[-1, 0], 0.01)
     gx, gy, gz, *accel = (np.interp(t, table[:, 0], column) for column in table.T[1:7])
@@ -85,6 +89,29 @@ def main() -> None:
         print(
             f"imufusion's recording, as it comes to rest: {name:12} {settling_deg(force, gyro, up):.2f} deg"
         )
+
+
+SPANS_S = ((1, 5), (5, 10), (10, 20), (40, 60))
+
+
+def begun_deg(one: Trial) -> np.ndarray:
+    """Medians (spans, 2) of the inclination's RMSE of VQF and levelling over starts in motion."""
+    n, moving, rng = round(60.0 / one.period_s), np.flatnonzero(one.moving), np.random.default_rng(1)
+    t, found = one.period_s * np.arange(n), []
+    for begin in np.linspace(moving[0], moving[-1] - n, 20).astype(int).tolist():
+        if not one.moving[begin]:
+            continue
+        part, bias = slice(begin, begin + n), rng.normal(size=3)
+        gyro, force = one.gyro[part] + np.radians(5.0) * bias / np.linalg.norm(bias), one.force[part]
+        ups = run_peer("VQF", gyro, force, one.period_s), level_three(Levelling(), t, force, gyro)
+        spans = [(t >= a) & (t < b) for a, b in SPANS_S]
+        found.append(
+            [
+                [Trial(gyro, force, one.truth[part], span, one.period_s).inclination_deg(up) for up in ups]
+                for span in spans
+            ]
+        )
+    return np.asarray(np.median(found, axis=0))
 
 
 def settling_deg(force: np.ndarray, gyro: np.ndarray, up: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armlogs import swung
+from armlogs import Arm, swung
 from firmware_build import LIMITS, compare, host, hostile, need, run, strew, write
 from firmware_rigs import header, rig
 from source_model import head_from_marker, inverse_series
@@ -429,10 +429,8 @@ def _true_marker(camera: Camera, u: float, v: float) -> np.ndarray:
     return np.asarray((R.T @ (ray * (normal @ t) / (normal @ ray) - t))[:2])
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_levelling_filter_is_the_projects_own(seed: int) -> None:
-    """But for gains that stand in a table of 17 instead of changing with every tick."""
-    arm = swung(seed, rate_hz=60.0, duration_s=60.0, bias_radps=0.02)
+def _levelled(arm: Arm, lost: slice = slice(0)) -> np.ndarray:
+    """Angles (n,) of the levelling filter with a calibrated sensor that gives nothing in these ticks."""
     constants = dict(header("levelling").values) | {
         "CALIB_IMU_ACCEL_BIAS_X_MPS2": 0.0,
         "CALIB_IMU_ACCEL_BIAS_Y_MPS2": 0.0,
@@ -441,16 +439,36 @@ def test_the_levelling_filter_is_the_projects_own(seed: int) -> None:
         "CALIB_MM_GYRO_BIAS_DT_RAD": 0.0,
         "CALIB_MM_DT_S": 1.0 / 60.0,
     }
-    reference = Reference(constants)
-    readings = zip(arm.ax.tolist(), arm.ay.tolist(), arm.gz.tolist(), strict=True)
-    phi = [
-        reference.step(Inputs(100.0, 100.0, ax, ay, gz, (0.078, 0.078), True, True, MODE_POSITION)).phi_rad
-        for ax, ay, gz in readings
+    reference, read = Reference(constants), np.ones(len(arm.t_s), dtype=bool)
+    read[lost] = False
+    given = [
+        Inputs(100.0, 100.0, ax, ay, gz, (0.078, 0.078), True, came, MODE_POSITION)
+        for ax, ay, gz, came in zip(*(x.tolist() for x in (arm.ax, arm.ay, arm.gz, read)), strict=True)
     ]
+    return np.array([reference.step(one).phi_rad for one in given])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_levelling_filter_is_the_projects_own(seed: int) -> None:
+    """But for gains that stand in a table of 17 instead of changing with every tick."""
+    arm = swung(seed, rate_hz=60.0, duration_s=60.0, bias_radps=0.02)
     wanted = filter_log(Levelling(1.5, 0.05), arm.t_s, arm.phi_acc, -arm.gz)[0]
-    error, late = np.degrees(np.array(phi) - wanted), arm.t_s > 5.0
+    error, late = np.degrees(_levelled(arm) - wanted), arm.t_s > 5.0
     assert np.abs(error).max() < 0.2
     assert error[late].std() < 0.05 * np.degrees((wanted - arm.phi)[late].std())
+
+
+@pytest.mark.parametrize(("lost_s", "most_deg"), [(0.05, 0.6), (0.2, 0.6), (2.0, 1.4)])
+def test_an_imu_that_was_lost_in_motion_leaves_no_error_in_the_levelled_angle(
+    lost_s: float, most_deg: float
+) -> None:
+    """A few ticks are bridged by the rates about them; seconds make a new start with the bias found."""
+    for seed in range(4):
+        arm = swung(seed, rate_hz=60.0, duration_s=40.0, rest_s=-5.0, bias_radps=0.03)
+        back = 1800 + round(60.0 * lost_s)
+        error = np.degrees(_levelled(arm, slice(1800, back)) - arm.phi)[back:]
+        assert np.sqrt(np.mean(error[:60] ** 2)) < most_deg
+        assert np.sqrt(np.mean(error[120:300] ** 2)) < most_deg
 
 
 @pytest.mark.parametrize("mode", [MODE_ORIENTATION, MODE_POSITION])

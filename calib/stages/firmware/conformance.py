@@ -46,7 +46,7 @@ class Wanted(Outputs):
 
     Attributes
     ----------
-    undecided_pwm : how far outputs were from the limits where the firmware decided otherwise on clamping.
+    undecided_pwm : how far outputs were from the limits where the firmware decided otherwise on them.
     undecided_m : the same of the fused estimator's gate and of its telling rest from motion.
     """
 
@@ -127,18 +127,21 @@ class Reference:
         ay = c["IMU_ACCEL_RATIO"] * (c["IMU_SIGN_AY"] * ay - c["IMU_ACCEL_BIAS_Y_MPS2"])
         gz = c["IMU_SIGN_GZ"] * gz
         levelling = bool(c["LEVELLING"])
-        if levelling and m.imu_age != _NEVER:
-            m.phi += m.integral - 0.5 * c["MM_DT_S"] * (gz + m.before)
+        afresh = m.imu_age > c["HOLD_TICKS"] // 2 if levelling else m.imu_age == _NEVER
+        if levelling and not afresh:
+            m.phi += (m.imu_age + 1) * (m.integral - 0.5 * c["MM_DT_S"] * (gz + m.before))
         m.before = gz
         if max(abs(ax), abs(ay)) <= c["IMU_ACCEL_WEAK_MPS2"]:
-            if m.imu_age == _NEVER:
+            if afresh:
+                m.imu_age = older(m.imu_age)
                 self._counted("imu")
                 return ACCEL_WEAK | IMU_HELD
             flags, e = ACCEL_WEAK, 0.0
         else:
             e = math.remainder(math.atan2(ay, ax) - c["IMU_MOUNT_ANGLE_RAD"] - m.phi, 2.0 * math.pi)
-        if m.imu_age == _NEVER:
-            m.phi = e
+        if afresh:
+            m.phi += e
+            m.level, m.ticks, m.step = 0.0, 0, 0
         elif levelling:
             i, S = m.step, m.level + e
             m.phi += c[f"calib_levelling_angle[{i}]"] * S
@@ -295,7 +298,11 @@ class Reference:
                 u = whole
             m.error[i] = e
             u += extra[i]
-            if not low <= u <= high:
+            saturated = not low <= u <= high
+            if decided is not None and bool(decided & SATURATED[i]) != saturated:
+                undecided = max(undecided, min(abs(u - low), abs(u - high)))
+                saturated = not saturated
+            if saturated:
                 flags |= SATURATED[i]
                 m.sum[i] += c[f"{stem}_BACK"] * (min(max(u, low), high) - u)
             pwm.append(min(max(u, low), high))
@@ -330,7 +337,7 @@ class Reference:
         Parameters
         ----------
         given : values that binary32 holds; NaN and infinity are allowed.
-        decided : flags of the firmware for this tick, whose decisions on clamping are then taken over.
+        decided : flags of the firmware for this tick, whose decisions on the limits are then taken over.
         """
         flags, head, q, undecided_m = self._estimate(given, decided)
         m = self.memory

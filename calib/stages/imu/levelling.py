@@ -34,17 +34,23 @@ from calib.core.units import GRAVITY_MPS2
 # In three axes the angle's place is taken by the up vector u in the sensor's axes, V is a vector in them too,
 # phi_acc - phi becomes a / g - u, and both turn with the sensor,
 #
-#     u' = u x (w - b) + K1 V,   V' = V x (w - b) + (a / g - u) - K0 V,   b' = K2 u x V.
+#     u' = u x (w - b) + K1 V,   V' = V x (w - b) + (a / g - u) - K0 V.
 #
-# A bias about the vertical does not show in this; at rest the mean rate shows it. A log that begins in a
-# swing begins with forces of any size and direction, so that V is not held in its first seconds.
+# K0 and K1 are those of a bias that is known, for all directions alike. The bias is found apart (Friedland,
+# IEEE Trans. Automatic Control 14(4), 1969): V_b and u_b are what an error of each axis' bias has done to V
+# and u since the start, so that V / (V_b) measures the bias, and M is its covariance. A bias about the
+# vertical does not show until the sensor has turned, and its gain stays open until then; gains alike for all
+# directions closed by then, and left 2 degrees of a bias of 5 deg/s. A log that begins in a swing begins
+# with forces of any size and direction, so that V is not held in its first seconds.
 #
 # An acceleration that is held moves V beyond what a velocity and the angle's error allow. In three axes |V|
 # is held to three of its standard deviations, that of V and that of the velocity together, so that 0.3 g for
 # 3 s turns the angle by 4 degrees and not by 15. Its own mean size over the last minute makes way for motion
-# that is faster than was foreseen: a log that begins in a swing of 1 m/s was 3 to 5 degrees off. The filter
-# in the plane, which a board runs, does without: an angle that is 40 degrees off after the sensor was lost
-# would take half a minute to come back.
+# that is faster than was foreseen: a log that begins in a swing of 1 m/s was 3 to 5 degrees off. What is cut
+# from V says nothing of the bias. Where the cuts add up to a velocity that nothing on a table has, the angle
+# is what is wrong, as after a gyroscope that was beyond its range, and the filter starts anew with the bias
+# that it has; so it does after a gap. The filter in the plane, which a board runs, does without a bound: an
+# angle that is 40 degrees off after the sensor was lost would take half a minute to come back.
 
 _TURN = 2.0 * math.pi
 _LASTING_S = 0.3
@@ -194,6 +200,11 @@ _QUIET_RADPS = 0.02
 _QUIET_G = 0.05
 _TURNED_G = 0.005
 """Rest: readings this near to their means, and a mean force that has moved by no more since rest began."""
+_REST_RADPS = 0.0015
+"""Standard deviation of the mean rate at rest as a bias; rotations show from 0.0025 rad/s on."""
+_GAP_S = 0.5
+_CUT_MPS, _FORGOTTEN_S = 12.0, 10.0
+"""A step beyond which, and a velocity cut from V lately by which, the filter starts anew."""
 
 
 @kernel()
@@ -209,57 +220,101 @@ def turned(x: FloatArray, w: FloatArray, dt: float) -> None:
 
 
 @kernel()
+def _bias(M: FloatArray, V_b: FloatArray, V: FloatArray, s: float, PH: FloatArray, db: FloatArray) -> None:
+    """Fills db by the update of the bias' covariance M with V, which V_b[i] of its axis i has moved.
+
+    s is the variance of V's elements without it; they are taken in one after the other.
+    """
+    for j in range(3):
+        innovation, variance = V[j], s
+        for i in range(3):
+            PH[i] = M[i, 0] * V_b[0, j] + M[i, 1] * V_b[1, j] + M[i, 2] * V_b[2, j]
+            innovation -= V_b[i, j] * db[i]
+        for i in range(3):
+            variance += V_b[i, j] * PH[i]
+        for i in range(3):
+            db[i] += PH[i] * innovation / variance
+            for m in range(3):
+                M[i, m] -= PH[i] * PH[m] / variance
+
+
+@kernel()
 def _run_three(
     t: FloatArray,
     force: FloatArray,
     gyro: FloatArray,
     densities: tuple[float, float, float],
-    P: FloatArray,
+    start: FloatArray,
     out: FloatArray,
 ) -> None:
     # Element by element: numba compiles 3 s longer for whole arrays and np.cross.
     r, q, q_b = densities
-    K, w = np.zeros(4), np.zeros(3)
-    u, V, b = force[0].copy(), np.zeros(3), np.zeros(3)
-    mean_w, mean_f, at_rest = gyro[0].copy(), force[0].copy(), force[0].copy()
-    still, size = 0.0, 0.0
-    for i in range(3):
-        out[0, i] = u[i]
-    for k in range(1, len(t)):
-        dt = t[k] - t[k - 1]
-        if dt > 0.0:
+    K, P, w, PH, db = np.zeros(4), np.zeros(6), np.zeros(3), np.zeros(3), np.zeros(3)
+    M, V_b, u_b = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    u, V, b, cut = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    mean_w, mean_f, at_rest = np.zeros(3), np.zeros(3), np.zeros(3)
+    still, size, begun = 0.0, 0.0, t[0]
+    for k in range(len(t)):
+        dt = t[k] - t[max(k - 1, 0)]
+        far = cut[0] * cut[0] + cut[1] * cut[1] + cut[2] * cut[2] > (_CUT_MPS / GRAVITY_MPS2) ** 2
+        if k == 0 or dt > _GAP_S or far:
+            begun, size, still = t[k], 0.0, 0.0
+            P[0], P[1], P[3] = start[0], 0.0, start[3]
+            for i in range(3):
+                u[i], V[i], cut[i] = force[k, i], 0.0, 0.0
+                mean_w[i], mean_f[i] = gyro[k, i], force[k, i]
+                for j in range(3):
+                    M[i, j], V_b[i, j], u_b[i, j] = start[5] if i == j else 0.0, 0.0, 0.0
+        elif dt > 0.0:
+            age = t[k] - begun + dt
             for i in range(3):
                 w[i] = 0.5 * (gyro[k - 1, i] + gyro[k, i]) - b[i]
             turned(u, w, dt)
             turned(V, w, dt)
+            turned(cut, w, dt)
             for i in range(3):
                 V[i] += dt * (force[k, i] - u[i])
-            _gains(P, dt, r, q, q_b, K)
+                turned(V_b[i], w, dt)
+                turned(u_b[i], w, dt)
+                for j in range(3):
+                    V_b[i, j] += dt * u_b[i, j]
+                # -u x the unit vector of axis i.
+                u_b[i, (i + 1) % 3] -= dt * u[(i + 2) % 3]
+                u_b[i, (i + 2) % 3] += dt * u[(i + 1) % 3]
+                M[i, i] += q_b * dt
+            _gains(P, dt, r, q, 0.0, K)
             length = math.sqrt(V[0] * V[0] + V[1] * V[1] + V[2] * V[2])
-            size += dt / min(t[k] - t[0] + dt, _MEMORY_S) * (length - size)
+            size += dt / min(age, _MEMORY_S) * (length - size)
             most = max(K[3], _MOST_SIZES * size)
-            part = most / length if t[k] - t[0] > _START_S and length > most else 1.0
+            part = most / length if age > _START_S and length > most else 1.0
             for i in range(3):
+                cut[i] += (1.0 - part) * V[i] - dt / _FORGOTTEN_S * cut[i]
                 V[i] *= part
-            b[0] += K[2] * (u[1] * V[2] - u[2] * V[1])
-            b[1] += K[2] * (u[2] * V[0] - u[0] * V[2])
-            b[2] += K[2] * (u[0] * V[1] - u[1] * V[0])
-            share = min(dt / min(t[k] - t[0] + dt, _MEAN_S), 1.0)
+                db[i] = 0.0
+            if part == 1.0:
+                _bias(M, V_b, V, r / dt / (1.0 - K[0]), PH, db)
+            share = min(dt / min(age, _MEAN_S), 1.0)
             quiet, stays = True, True
             for i in range(3):
-                u[i] += K[1] * V[i]
-                V[i] -= K[0] * V[i]
+                for j in range(3):
+                    u_b[j, i] -= K[1] * V_b[j, i]
+                    V_b[j, i] -= K[0] * V_b[j, i]
+                u[i] += K[1] * V[i] + u_b[0, i] * db[0] + u_b[1, i] * db[1] + u_b[2, i] * db[2]
+                V[i] -= K[0] * V[i] + V_b[0, i] * db[0] + V_b[1, i] * db[1] + V_b[2, i] * db[2]
+                b[i] += db[i]
                 mean_w[i] += share * (gyro[k, i] - mean_w[i])
                 mean_f[i] += share * (force[k, i] - mean_f[i])
                 quiet = quiet and abs(gyro[k, i] - mean_w[i]) < _QUIET_RADPS
                 quiet = quiet and abs(force[k, i] - mean_f[i]) < _QUIET_G
                 stays = stays and abs(mean_f[i] - at_rest[i]) < _TURNED_G
             still = still + dt if quiet and (stays or still < _REST_S / 2) else 0.0
+            share = min(dt / (2.0 * _MEAN_S), 1.0) if still >= _REST_S else 0.0
             for i in range(3):
                 if still < _REST_S / 2:
                     at_rest[i] = mean_f[i]
-                if still >= _REST_S:
-                    b[i] += min(dt / (2.0 * _MEAN_S), 1.0) * (mean_w[i] - b[i])
+                b[i] += share * (mean_w[i] - b[i])
+                for j in range(3):
+                    M[i, j] += share * ((_REST_RADPS**2 if i == j else 0.0) - M[i, j])
         for i in range(3):
             out[k, i] = u[i]
 
