@@ -217,6 +217,34 @@ def test_sigma_holds_what_is_another_in_one_log(
     assert abs(found.rest_angle_rad - true_rest) < 3.0 * found.rest_angle_sigma
 
 
+@pytest.mark.parametrize(
+    ("late_s", "scenarios", "word"),
+    [
+        (0.0, (1,), ""),
+        (0.0025, (0, 1, 2), "remark"),
+        (-0.0025, (0, 1, 2), "remark"),
+        (0.01, (0, 1, 2), "poor"),
+    ],
+)
+def test_accelerations_that_come_late_are_told_and_in_sigma(
+    late_s: float, scenarios: tuple[int, ...], word: str
+) -> None:
+    """As of sensors with low-passes of their own, which put the IMU 9 deviations off, and of slow motion."""
+    trial = known(SimulatedRig())
+    logs = [align_log(twin_log(trial.rig, *MOTIONS[k], k)) for k in scenarios]
+    for k, log in enumerate(logs):
+        readings = log.readings.copy()
+        for axis in range(2):
+            readings[:, axis] = np.interp(log.imu_s - late_s, log.imu_s, log.readings[:, axis])
+        logs[k] = replace(log, readings=readings)
+    found = align(logs, prior_settings(trial.view))
+    late = [one for one in judge(found).findings if one.text.startswith("accelerations come about")]
+    assert [one.severity for one in late] == [word] * bool(word)
+    for one in found.apart if word else ():
+        assert one.away == pytest.approx(late_s, rel=0.15)
+    assert np.abs(scores(trial, found)).max() < 3.0
+
+
 def test_columns_that_are_swapped_are_judged() -> None:
     """The fit then puts the marker where no picture shows it, and that has no derivative."""
     trial = known(SimulatedRig())

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
@@ -1151,13 +1152,19 @@ _TOLD = 1e-3
 """Share of the information that is left beside other quantities, below which a log does not tell it."""
 
 
+_LATE, _LATE_S = "accelerometer's delay", (1e-3, 4e-3)
+"""Delays of the accelerometer beside the gyroscope that are a remark, and that make an alignment poor."""
+_DIFFERENCE_S = 0.02
+"""Differences over less see the noise that a spline follows, and make of it a delay that is not there."""
+
+
 @dataclass(frozen=True)
 class Apart:
-    """A log in which a quantity is another one than in the others.
+    """A quantity that is another one in a log than in the others, or that the model does not have.
 
     Attributes
     ----------
-    log : its number. name : of `SENSOR`. away, deviations : by how much.
+    log : its number, -1 for all. name : of `SENSOR`, or `_LATE`. away, deviations : by how much.
     moved : (14,) how far this moves the quantities of all logs.
     """
 
@@ -1168,44 +1175,71 @@ class Apart:
     moved: FloatArray
 
 
+Column = Iterator[tuple[Rows, FloatArray, FloatArray, FloatArray]]
+"""Rows, what one more quantity changes of their predictions, pull and weight, a chunk at a time."""
+
+
+def _one_more(
+    problem: Problem, fit: Fit, column: Callable[[Stretch, FloatArray], Column], log: int, name: str
+) -> Apart | None:
+    """One more quantity of a log, or of all (-1), as far as the readings tell it beside all others."""
+    right, score, alone, told = np.zeros(len(SENSOR)), 0.0, 0.0, 0.0
+    for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
+        if log not in (-1, stretch.log):
+            continue
+        to_c = np.zeros(c.size)
+        for rows, change, pull, weight in column(stretch, c):
+            score += float((pull * change).sum())
+            alone += float((weight * change**2).sum())
+            gathered(rows.span, rows.basis, rows.by, weight * change, to_c, right)
+        own = fit.arrow.own(i, to_c)
+        told += float(to_c @ own)
+        right -= fit.arrow.B[i].T @ own
+    moved = cho_solve(fit.arrow.S, right)
+    known = alone - told - float(right @ moved)
+    if known <= _TOLD * alone:
+        return None
+    away = score / known
+    return Apart(log, name, away, abs(score) / math.sqrt(known), away * moved)
+
+
 def _apart(problem: Problem, fit: Fit, logs: int) -> list[Apart]:
-    """Logs with quantities of their own, of which a single one has none."""
-    out = []
-    for log, (name, least) in product(range(logs if logs > 1 else 0), _MAY_DIFFER.items()):
-        at, right, score, alone, told = 6 + SENSOR.index(name), np.zeros(len(SENSOR)), 0.0, 0.0, 0.0
-        for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
-            if stretch.log != log:
-                continue
-            to_c = np.zeros(c.size)
-            for rows, pull, weight in _terms(problem, fit, stretch, c, name):
-                # A place that no picture shows has no derivative.
-                change = np.where(weight > 0.0, rows.by[:, :, at], 0.0)
-                score += float((pull * change).sum())
-                alone += float((weight * change**2).sum())
-                gathered(rows.span, rows.basis, rows.by, weight * change, to_c, right)
-            own = fit.arrow.own(i, to_c)
-            told += float(to_c @ own)
-            right -= fit.arrow.B[i].T @ own
-        moved = cho_solve(fit.arrow.S, right)
-        known = alone - told - float(right @ moved)
-        if known > _TOLD * alone and abs(score) > max(_SURELY_APART * math.sqrt(known), least * known):
-            away = score / known
-            out.append(Apart(log, name, away, abs(score) / math.sqrt(known), away * moved))
-    return out
+    """Logs with quantities of their own, of which a single one has none; an accelerometer that is late."""
+    out = [_one_more(problem, fit, partial(_late, fit), -1, _LATE)]
+    for log, name in product(range(logs if logs > 1 else 0), _MAY_DIFFER):
+        out.append(_one_more(problem, fit, partial(_own, problem, fit, name), log, name))
+    least = _MAY_DIFFER | {_LATE: _LATE_S[0]}
+    return [
+        one for one in out
+        if one is not None and one.deviations > _SURELY_APART and abs(one.away) > least[one.name]
+    ]  # fmt: skip
 
 
-def _terms(
-    problem: Problem, fit: Fit, stretch: Stretch, c: FloatArray, name: str
-) -> Iterator[tuple[Rows, FloatArray, FloatArray]]:
-    """Rows, pull and weight of what a quantity changes: pictures or the IMU's readings."""
+def _own(problem: Problem, fit: Fit, name: str, stretch: Stretch, c: FloatArray) -> Column:
+    """What a quantity changes: pictures or the IMU's readings."""
+    at = 6 + SENSOR.index(name)
     if name == SENSOR[_OFFSET]:
         for off, rows in _pictures(problem, stretch, c, fit.sensor):
             _, pull, weight, _ = _picture_terms(problem, fit.noise, off)
-            yield rows, pull, weight
+            # A place that no picture shows has no derivative.
+            yield rows, np.where(weight > 0.0, rows.by[:, :, at], 0.0), pull, weight
         return
     for off, rows in _readings(stretch, c, fit.sensor):
         _, pull, weight = imu_terms(off, fit.noise.imu)
-        yield rows, pull, weight
+        yield rows, rows.by[:, :, at], pull, weight
+
+
+def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
+    """What accelerations that are late beside the rates change of the IMU's readings."""
+    for part in chunks(len(stretch.imu_s)):
+        t = stretch.imu_s[part]
+        before, rows, after = (
+            imu_rows(stretch.knots, c, fit.sensor, t + step) for step in (-_DIFFERENCE_S, 0.0, _DIFFERENCE_S)
+        )
+        change = (before.predicted - after.predicted) / (2.0 * _DIFFERENCE_S)
+        change[:, 2] = 0.0
+        _, pull, weight = imu_terms(stretch.readings[part] - rows.predicted, fit.noise.imu)
+        yield rows, change, pull, weight
 
 
 def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
@@ -1493,6 +1527,18 @@ def _differing(found: Alignment) -> Iterator[Finding]:
             )
 
 
+def _late_accelerometer(found: Alignment) -> Iterator[Finding]:
+    for one in found.apart:
+        if one.name == _LATE:
+            when = "after" if one.away > 0.0 else "before"
+            yield Finding(
+                "poor" if abs(one.away) > _LATE_S[1] else "remark",
+                f"accelerations come about {1e3 * abs(one.away):.1f} ms {when} the rates of the same motion, "
+                "which moves where the IMU is taken to be",
+                "give accelerometer and gyroscope low-passes of one bandwidth, and read both at once",
+            )
+
+
 _SHOWN = {"": (100.0, "%"), "m": (1e3, "mm"), "s": (1e3, "ms"), "rad": (180.0 / math.pi, "deg")}
 _SHIFTS = ("shift_x_m", "shift_y_m", "stretch")
 _MOVED = (
@@ -1573,7 +1619,8 @@ def _separable(found: Alignment) -> Iterator[Finding]:
 
 def judge(found: Alignment) -> Verdict:
     """Verdict on an alignment by its logs alone."""
-    findings = [*_data(found), *_contradicted(found), *_differing(found), *_known(found), *_separable(found)]
+    findings = [*_data(found), *_contradicted(found), *_differing(found), *_late_accelerometer(found)]
+    findings += [*_known(found), *_separable(found)]
     if not np.isfinite(found.covariance).all():
         findings.append(Finding("unidentifiable", "the covariance is not finite"))
     return Verdict.of([*findings, *(Finding("remark", text) for text in found.left_out)])
