@@ -93,11 +93,14 @@ def swing_adaptive(
     return Motion(times, np.hstack([states, np.tile(start[[8, 9, 8, 9]], (len(times), 1))]))
 
 
-def _pumps(p: PumpCoefficients, row: FloatArray, g: FloatArray, t: float) -> FloatArray:
+def _pumps(
+    pumps: tuple[PumpCoefficients, PumpCoefficients], row: FloatArray, g: FloatArray, t: float
+) -> FloatArray:
     """lag1, lag2, force1, force2 [N] at the time t after the tick that began with `row`."""
-    decay = math.exp(-0.5 * t / p.lag_s)
-    lag1, _, force1 = advance_pump(p, float(row[6]), float(row[8]), float(g[0]), decay, t)
-    lag2, _, force2 = advance_pump(p, float(row[7]), float(row[9]), float(g[1]), decay, t)
+    (lag1, _, force1), (lag2, _, force2) = (
+        advance_pump(p, float(row[6 + i]), float(row[8 + i]), float(g[i]), math.exp(-0.5 * t / p.lag_s), t)
+        for i, p in enumerate(pumps)
+    )
     return np.array([lag1, lag2, force1, force2])
 
 

@@ -86,6 +86,7 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
     late_s = float(rng.uniform(0.015, 0.035))
     truth["rest_length_m"] = 0.065 + 5e-4 * float(rng.standard_normal())
     rig = SimulatedRig()
+    truth["lag_ratio"] = float(rng.uniform(0.85, 1.15))
     truth["inertia_kgm2"] = rig.plant.inertia_kgm2 * float(rng.uniform(0.92, 1.08))
     plant = replace(
         rig.plant,
@@ -96,7 +97,12 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
         bending_N_per_rad2=truth["bending_N_per_rad2"],
         creep=Creep(truth["lambda1_per_s"], truth["lambda2_N_per_m"], -1.0),
     )
-    pump = replace(rig.pump, lag_s=truth["lag_s"], deflation=RateLimit(truth["falling_N_per_s"]))
+    pump = replace(
+        rig.pump,
+        lag_s=truth["lag_s"],
+        lag_ratio=truth["lag_ratio"],
+        deflation=RateLimit(truth["falling_N_per_s"]),
+    )
     return (
         replace(
             rig,

@@ -14,7 +14,7 @@ from calib.io.logs import Log
 from calib.stages.actuator.dynamics import Coefficients, coefficients
 from calib.stages.actuator.kinematics import forward
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.pump import PumpCoefficients, delayed, pump_coefficients, settling_force_N
+from calib.stages.actuator.pump import delayed, pump_coefficients, settling_force_N
 from calib.stages.actuator.simulate import STATE, RigState, check_start, largest_step_s
 from calib.stages.actuator.simulate import run as run_kernel
 from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
@@ -118,7 +118,7 @@ class _Plant:
         self.rig = rig
         self.tick_s = rig.pump.tick_s
         self.c: Coefficients = coefficients(plant)
-        self.p: PumpCoefficients = pump_coefficients(rig.pump)
+        self.p = pump_coefficients(rig.pump)
         self.held = np.zeros((2, 2))
         step, largest = self.tick_s / _SUBSTEPS, largest_step_s(plant)
         if step > largest:

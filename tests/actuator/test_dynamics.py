@@ -246,7 +246,7 @@ def test_free_swing_against_dop853() -> None:
 
 @pytest.mark.parametrize("deflation", [RateLimit(), Orifice()])
 def test_pumps_against_dop853(deflation: RateLimit | Orifice) -> None:
-    pump, pwm = Pump(deflation=deflation), random_commands(1, 8)
+    pump, pwm = Pump(deflation=deflation, lag_ratio=0.8), random_commands(1, 8)
     fixed = simulate(PUMPED, pump, pwm)
     exact = simulate_adaptive(PUMPED, pump, pwm, rtol=1e-12, atol=1e-14)
     assert np.abs(fixed.q_m - exact.q_m).max() < 1e-6
@@ -350,7 +350,6 @@ def python_run(plant: Plant, pump: Pump, start: FloatArray, g: FloatArray, subst
     T = np.array([[0.5, 0.5], [0.5 / r, -0.5 / r]])
     y = np.concatenate([T @ start[:2], T @ start[2:4], [start[4] + start[5], start[4] - start[5]]])
     lag, force = start[6:8].copy(), start[8:10].copy()
-    decay = math.exp(-0.5 * h / p.lag_s)
 
     def slope(y: FloatArray, F: FloatArray) -> FloatArray:
         ddl, ddphi, ds, dd = rates(c, *y.tolist(), *F.tolist())
@@ -358,7 +357,10 @@ def python_run(plant: Plant, pump: Pump, start: FloatArray, g: FloatArray, subst
 
     for row in g:
         for _ in range(substeps):
-            both = [advance_pump(p, lag[i], force[i], row[i], decay, h) for i in range(2)]
+            both = [
+                advance_pump(one, lag[i], force[i], row[i], math.exp(-0.5 * h / one.lag_s), h)
+                for i, one in enumerate(p)
+            ]
             middle, end = np.array([b[1] for b in both]), np.array([b[2] for b in both])
             k1 = slope(y, force)
             k2 = slope(y + 0.5 * h * k1, middle)
@@ -374,7 +376,7 @@ def python_run(plant: Plant, pump: Pump, start: FloatArray, g: FloatArray, subst
 @pytest.mark.parametrize("deflation", [RateLimit(), Orifice()])
 @pytest.mark.parametrize("plant", [pumps_connected(), Plant(gravity_mps2=(0.5, 9.81))])
 def test_compiled_is_the_python_text(plant: Plant, deflation: RateLimit | Orifice) -> None:
-    pump = Pump(deflation=deflation)
+    pump = Pump(deflation=deflation, lag_ratio=1.3)
     g = np.array([[1.5, 0.2]] * 5 + [[0.0, 1.0]] * 5)
     start = state_row(plant, 0.3, 0.07, (0.4, 0.1))
     out = np.empty((10, 10))
@@ -439,7 +441,8 @@ def mixed(sets: int, seed: int) -> tuple[list[Plant], list[Pump]]:
             )
         )
         deflation = Orifice(rng.uniform(0.8, 1.2)) if i % 3 == 0 else RateLimit(rng.uniform(0.3, 0.5))
-        pumps.append(Pump(lag_s=rng.uniform(0.5, 0.9), delay_ticks=i % 4, deflation=deflation))
+        lag_s, lag_ratio = rng.uniform(0.5, 0.9), rng.uniform(0.8, 1.2)
+        pumps.append(Pump(lag_s=lag_s, lag_ratio=lag_ratio, delay_ticks=i % 4, deflation=deflation))
     return plants, pumps
 
 

@@ -365,7 +365,7 @@ def test_a_log_of_another_plant_is_contradicted_and_one_that_tells_more_is_not(
 
 @pytest.mark.parametrize("ticks", [0, 1, 5, -5])
 def test_commands_of_one_pump_that_come_late_are_named(ticks: int) -> None:
-    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "falling_N_per_s")
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "lag_ratio", "falling_N_per_s")
     tracks = []
     for one in (track("prbs"), track("steps", seed=1)):
         pwm, pump = one.pwm.copy(), int(ticks < 0)
@@ -533,7 +533,7 @@ def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, seed: int, tmp_
     rig_yaml = tmp_path / "rig.yaml"
     known = rig_file(rig_yaml)
     rig, _ = varied(seed)
-    rig = replace(rig, pump=replace(rig.pump, deflation=law))
+    rig = replace(rig, pump=replace(rig.pump, deflation=law, lag_ratio=1.0))
     path = log_file(tmp_path / "deflate.csv", rig, "deflate", 1, 12.0)
     tracks = [read_track(Files((path,), rig_yaml), path, known, Machine(), PoseOptions())]
     found = fit_tracks(Machine(), tracks, either_law=True)

@@ -194,7 +194,7 @@ def test_closed_form_of_the_rate_limit_is_exact(
     g: float, lag: float, above: float, pieces: list[float]
 ) -> None:
     """However a span is cut, the end is the same, and no piece falls faster than the limit."""
-    p = pump_coefficients(Pump())
+    p, _ = pump_coefficients(Pump())
     x, f = lag, lag + above
     for dt in pieces:
         before = f
@@ -210,7 +210,7 @@ def test_closed_form_of_the_rate_limit_is_exact(
 def test_orifice_against_an_adaptive_integrator() -> None:
     """Up, down and up again, with the valve closing and opening in between."""
     pump = Pump(deflation=Orifice(), delay_ticks=0)
-    p = pump_coefficients(pump)
+    p, _ = pump_coefficients(pump)
     a, b = p.laminar, p.turbulent
     force, f = [], 0.0
     reference, r = [], 0.0

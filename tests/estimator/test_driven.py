@@ -417,7 +417,7 @@ def test_what_is_considered_stays_and_the_rest_learns(kind: int) -> None:
     assert gated[0 if kind == CAMERA else 2] == 0.0
 
 
-PUMPS = (Pump(), Pump(deflation=Orifice()))
+PUMPS = (Pump(), Pump(deflation=Orifice(), lag_ratio=1.2))
 
 
 def some_state(seed: int) -> FloatArray:

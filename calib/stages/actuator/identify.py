@@ -70,6 +70,8 @@ PARAMETERS: dict[str, Spec] = {
     "lambda2_N_per_m": Spec("N/m", 0.01, 500.0, 3.0, "all", "lambda2"),
     "lambda3": Spec("", -50.0, -0.01, 0.3, "all", "lambda3"),
     "lag_s": Spec("s", 0.01, 10.0, 0.2, "pumps", "tau"),
+    # Two pumps of one make, with hoses of other lengths.
+    "lag_ratio": Spec("", 0.2, 5.0, 0.1, "pumps", "tau2/tau1", 0.1),
     "strength1": Spec("", 0.05, 10.0, 0.2, "pumps", "strength1"),
     "strength2": Spec("", 0.05, 10.0, 0.2, "pumps", "strength2"),
     "falling_N_per_s": Spec("N/s", 0.01, 50.0, 0.1, "pumps", "R"),
@@ -91,7 +93,7 @@ _PLAYS = {
 """Plays of the pumps, and widths from which they are sought."""
 
 _OF_PLANT = ("mass_kg", "inertia_kgm2", "rest_length_m", "stiffness_scale", "bending_N_per_rad2")
-_OF_PUMP = ("lag_s", "play_pwm", "play_N")
+_OF_PUMP = ("lag_s", "lag_ratio", "play_pwm", "play_N")
 """Parameters that plant and pumps have by the same names."""
 
 
@@ -2041,7 +2043,7 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
         one, other = ("pwm1", "pwm2") if late > 0.0 else ("pwm2", "pwm1")
         text = (
             f"{one} comes about {1e3 * abs(late):.0f} ms after {other}, as the rig answers them; the model "
-            "has one dead time and one lag for both pumps, so damping and lag are not the rig's"
+            "has one dead time for both pumps, so damping and lags are not the rig's"
         )
         out.append(Finding("inconsistent", text, "check the times of both columns, and hoses and valves"))
     return out

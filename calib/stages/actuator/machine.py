@@ -63,5 +63,7 @@ def _pump(values: Mapping[str, Any], plant: Plant) -> Pump:
         else RateLimit(**given("falling_N_per_s"))
     )
     return Pump(
-        ElongationForce(**static), deflation, **given("lag_s", "delay_ticks", "tick_s", "play_pwm", "play_N")
+        ElongationForce(**static),
+        deflation,
+        **given("lag_s", "lag_ratio", "delay_ticks", "tick_s", "play_pwm", "play_N"),
     )

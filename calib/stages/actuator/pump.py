@@ -114,13 +114,14 @@ class Orifice:
 
 @dataclass(frozen=True)
 class Pump:
-    """One pump with its hose and orifice; both pumps are alike.
+    """Both pumps with their hoses and orifices, alike but for their lags.
 
     Attributes
     ----------
     static : `ElongationForce`.
     deflation : `RateLimit` or `Orifice`.
-    lag_s : time constant of the rise.
+    lag_s, lag_ratio : time constant of the rise, the geometric mean of both, and that of the second over that
+        of the first.
     delay_ticks : ticks from a command to its effect.
     tick_s : period of the commands.
     play_pwm, play_N : widths of the plays before and behind the static force.
@@ -129,10 +130,17 @@ class Pump:
     static: ElongationForce = ElongationForce()
     deflation: RateLimit | Orifice = RateLimit()
     lag_s: float = 0.7
+    lag_ratio: float = 1.0
     delay_ticks: int = 2
     tick_s: float = TICK_S
     play_pwm: float = 0.0
     play_N: float = 0.0
+
+    @property
+    def lags_s(self) -> tuple[float, float]:
+        """Time constants of both pumps."""
+        share = math.sqrt(self.lag_ratio)
+        return self.lag_s / share, self.lag_s * share
 
     def at(self, tick_s: float) -> Pump:
         """The same pump with commands of another period; its delay in whole ticks of that."""
@@ -142,7 +150,7 @@ class Pump:
 
 
 class PumpCoefficients(NamedTuple):
-    """What `advance_pump` needs, derived from a `Pump`."""
+    """What `advance_pump` needs of one pump, derived from `Pump`."""
 
     kind: int
     lag_s: float
@@ -151,12 +159,14 @@ class PumpCoefficients(NamedTuple):
     turbulent: float
 
 
-def pump_coefficients(pump: Pump) -> PumpCoefficients:
-    """Coefficients of the compiled kernel."""
-    law = pump.deflation
+def pump_coefficients(pump: Pump) -> tuple[PumpCoefficients, PumpCoefficients]:
+    """Coefficients of the compiled kernel, of both pumps."""
+    law, (lag1_s, lag2_s) = pump.deflation, pump.lags_s
     if isinstance(law, RateLimit):
-        return PumpCoefficients(RATE_LIMIT, pump.lag_s, float(law.falling_N_per_s), 1.0, 0.0)
-    return PumpCoefficients(ORIFICE, pump.lag_s, 0.0, law.laminar_s, law.turbulent_s2_per_N)
+        one = PumpCoefficients(RATE_LIMIT, lag1_s, float(law.falling_N_per_s), 1.0, 0.0)
+    else:
+        one = PumpCoefficients(ORIFICE, lag1_s, 0.0, law.laminar_s, law.turbulent_s2_per_N)
+    return one, one._replace(lag_s=lag2_s)
 
 
 def static_force_N(pump: Pump, pwm: FloatArray) -> FloatArray:

@@ -75,12 +75,14 @@ class PumpParameters(Section):
 
     Attributes
     ----------
+    lag_s, lag_ratio : geometric mean of both lags, and that of the second pump over that of the first.
     elongation_mm : measured on the rig, so that where it is given its forces follow from the rig's own
         springs, otherwise from the nominal ones.
     strength : factors on the static forces of both pumps, which are never quite alike.
     """
 
     lag_s: Number | None = quantity(None, label="lag", fact=True, ge=1e-3, le=60.0)
+    lag_ratio: Number | None = quantity(None, label="lag of pump 2 over that of pump 1", ge=0.1, le=10.0)
     delay_ticks: Annotated[int, Field(strict=True)] | None = quantity(None, label="delay", ge=0, le=1000)
     tick_s: Number | None = quantity(None, label="tick", ge=1e-3, le=0.1)
     supply_V: Number | None = quantity(None, label="supply", ge=1.0, le=100.0)

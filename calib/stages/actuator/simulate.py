@@ -58,8 +58,8 @@ STATE = (
 LANES = 16
 """Sets side by side; with fewer the compiler leaves the loop scalar, with more nothing is gained."""
 
-LANE_COEFFICIENTS = 18
-"""Rows of the coefficients of `run_lanes`: 13 of the plant, decay, and 4 of the pump."""
+LANE_COEFFICIENTS = 20
+"""Rows of the coefficients of `run_lanes`: 13 of the plant, 2 decays, 2 lags, and 3 of the pumps."""
 
 
 @inlined
@@ -95,7 +95,7 @@ def _step(
 @kernel()
 def run(
     c: Coefficients,
-    pump: PumpCoefficients,
+    pumps: tuple[PumpCoefficients, PumpCoefficients],
     start: FloatArray,
     static_N: FloatArray,
     tick_s: float,
@@ -110,7 +110,8 @@ def run(
     angle beyond `LARGEST_ANGLE_RAD`, or no number at all), or -1.
     """
     h = tick_s / substeps
-    decay = math.exp(-0.5 * h / pump.lag_s)
+    one, two = pumps
+    decay1, decay2 = math.exp(-0.5 * h / one.lag_s), math.exp(-0.5 * h / two.lag_s)
     r = c.r
     y = (
         0.5 * (start[0] + start[1]),
@@ -125,8 +126,8 @@ def run(
     for tick in range(len(static_N)):
         g1, g2 = static_N[tick, 0], static_N[tick, 1]
         for _ in range(substeps):
-            x1, middle1, end1 = advance_pump(pump, x1, f1, g1, decay, h)
-            x2, middle2, end2 = advance_pump(pump, x2, f2, g2, decay, h)
+            x1, middle1, end1 = advance_pump(one, x1, f1, g1, decay1, h)
+            x2, middle2, end2 = advance_pump(two, x2, f2, g2, decay2, h)
             y = _step(c, y, h, (f1, f2), (middle1, middle2), (end1, end2))
             f1, f2 = end1, end2
             # Written so that NaN fails as well.
@@ -184,8 +185,8 @@ def run_lanes(
 
     Parameters
     ----------
-    table : (LANE_COEFFICIENTS * LANES,) the first 13 of `Coefficients`, the pumps' decay in half a step
-        and the last 4 of `PumpCoefficients`.
+    table : (LANE_COEFFICIENTS * LANES,) the first 13 of `Coefficients`, both pumps' decay in half a
+        step, their lags, and the last 3 of `PumpCoefficients`.
     lanes : (12 * LANES,) l, phi, dl, dphi, z1 + z2, z1 - z2, lags, forces, then 1 for a lane that is in
         the model and its number of good steps; written to.
     static_N : (n, 2 * LANES) static forces in effect, those of bellows 1 first.
@@ -212,18 +213,15 @@ def run_lanes(
                     0.0,
                     0,
                 )
-                decay = table[13 * LANES + i]
-                pump = PumpCoefficients(
-                    kind,
-                    table[14 * LANES + i],
-                    table[15 * LANES + i],
-                    table[16 * LANES + i],
-                    table[17 * LANES + i],
-                )
+                decay1, decay2 = table[13 * LANES + i], table[14 * LANES + i]
+                falling, laminar = table[17 * LANES + i], table[18 * LANES + i]
+                turbulent = table[19 * LANES + i]
+                one = PumpCoefficients(kind, table[15 * LANES + i], falling, laminar, turbulent)
+                two = PumpCoefficients(kind, table[16 * LANES + i], falling, laminar, turbulent)
                 g1, g2 = static_N[tick, i], static_N[tick, LANES + i]
                 f1, f2 = lanes[8 * LANES + i], lanes[9 * LANES + i]
-                x1, middle1, end1 = advance_pump(pump, lanes[6 * LANES + i], f1, g1, decay, step_s)
-                x2, middle2, end2 = advance_pump(pump, lanes[7 * LANES + i], f2, g2, decay, step_s)
+                x1, middle1, end1 = advance_pump(one, lanes[6 * LANES + i], f1, g1, decay1, step_s)
+                x2, middle2, end2 = advance_pump(two, lanes[7 * LANES + i], f2, g2, decay2, step_s)
                 y = (
                     lanes[i],
                     lanes[LANES + i],
@@ -369,8 +367,10 @@ def _block(task: _Task, indices: Sequence[int]) -> None:
     h = pumps[0].tick_s / task.substeps
     table = np.empty((LANE_COEFFICIENTS, LANES))
     for lane, (i, pump) in enumerate(zip(padded, pumps, strict=True)):
-        decay = math.exp(-0.5 * h / pump.lag_s)
-        table[:, lane] = (*coefficients(task.plants[i])[:13], decay, *pump_coefficients(pump)[1:])
+        one, two = pump_coefficients(pump)
+        lags_s = one.lag_s, two.lag_s
+        decays = [math.exp(-0.5 * h / lag_s) for lag_s in lags_s]
+        table[:, lane] = (*coefficients(task.plants[i])[:13], *decays, *lags_s, *one[2:])
     radius = table[2]
     begin = task.start[padded].T
     lanes = np.empty((12, LANES))
@@ -381,7 +381,7 @@ def _block(task: _Task, indices: Sequence[int]) -> None:
     static = np.stack([task.static_N[pump] for pump in pumps], axis=-1)
     ticks = len(static)
     out = np.empty((ticks, 10 * LANES))
-    kind = pump_coefficients(pumps[0]).kind
+    kind = pump_coefficients(pumps[0])[0].kind
     flat = lanes.reshape(-1)
     run_lanes(kind, table.reshape(-1), flat, static.reshape(ticks, -1), h, task.substeps, out)
     alive, good = flat[10 * LANES : 11 * LANES], flat[11 * LANES :]
@@ -408,7 +408,7 @@ def _blocks(plants: Sequence[Plant], pumps: Sequence[Pump]) -> tuple[list[list[i
         if c.gravity:
             alone.append(i)
         else:
-            alike.setdefault(pump_coefficients(pump).kind, []).append(i)
+            alike.setdefault(pump_coefficients(pump)[0].kind, []).append(i)
     blocks = [group[k : k + LANES] for group in alike.values() for k in range(0, len(group), LANES)]
     return blocks, alone
 

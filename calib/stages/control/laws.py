@@ -340,11 +340,13 @@ def _arriving(model: Model, pwm: Pair) -> Pair:
 
 
 def _after(model: Model, state: PumpEstimate, pwm: Pair) -> tuple[Pair, Pair]:
-    p, dt = pump_coefficients(model.pump), model.tick_s
-    decay = math.exp(-0.5 * dt / model.pump.lag_s)
-    g = _arriving(model, pwm)
-    x1, _, F1 = advance_pump(p, state.lag_N[0], state.force_N[0], g[0], decay, dt)
-    x2, _, F2 = advance_pump(p, state.lag_N[1], state.force_N[1], g[1], decay, dt)
+    dt = model.tick_s
+    (x1, _, F1), (x2, _, F2) = (
+        advance_pump(p, lag, force, g, math.exp(-0.5 * dt / p.lag_s), dt)
+        for p, lag, force, g in zip(
+            pump_coefficients(model.pump), state.lag_N, state.force_N, _arriving(model, pwm), strict=True
+        )
+    )
     return (x1, x2), (F1, F2)
 
 
@@ -385,7 +387,7 @@ def least_pwm(model: Model, state: PumpEstimate, share: float) -> Pair:
     share : 0 holds the force, 1 lets it fall as fast as it can.
     """
     F = np.array(state.force_N)
-    floor = np.maximum(F - share * model.pump.lag_s * falling_rate(model, F), 0.0)
+    floor = np.maximum(F - share * np.array(model.pump.lags_s) * falling_rate(model, F), 0.0)
     low = pwm_of_force(model, floor).tolist()
     return low[0], low[1]
 
@@ -405,7 +407,7 @@ def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horiz
     # With an orifice the lag acts on the force itself.
     x = F if isinstance(model.pump.deflation, Orifice) else np.array(state.lag_N)
     target = np.maximum(np.asarray(wanted_N), F - T * falling_rate(model, F))
-    a = math.exp(-T / model.pump.lag_s)
+    a = np.exp(-T / np.array(model.pump.lags_s))
     pwm = pwm_of_force(model, (target - a * x) / (1.0 - a))
     edge = pwm_of_force(model, np.full(2, 1e-9))
     idle = (np.asarray(wanted_N) < _IDLE_N) & (F < _IDLE_N)

@@ -104,9 +104,9 @@ INVOLVED = DYNAMIC + len(PARAMETER)
 
 PLANT = (
     "m", "J", "r", "l0", "k0", "k1", "k2", "k3", "damping", "bending", "lambda1", "lambda2", "lambda3",
-    "gx", "gy", "gravity", "kind", "lag_s", "falling", "laminar", "turbulent",
+    "gx", "gy", "gravity", "kind", "lag1_s", "falling", "laminar", "turbulent", "lag2_s",
 )  # fmt: skip
-"""Nominal values, those of `Coefficients` and then of `PumpCoefficients`, as the vector `plant`."""
+"""Nominal values, of `Coefficients`, then of `PumpCoefficients` and the second lag: the vector `plant`."""
 
 STEP_S, STEP_RATE, LEAST_STEP_S = 0.0035, 1.5, 5e-5
 """Longest Runge-Kutta step, the most that it may be times the stiffest rate, and the shortest step, for 30
@@ -161,11 +161,12 @@ def _per_factor(deviation: float) -> float:
 
 
 @kernel(arrays=False)
-def _pump(plant: FloatArray, lag: float, deflation: float) -> PumpCoefficients:
+def _pump(plant: FloatArray, side: int, lag: float, deflation: float) -> PumpCoefficients:
     # An orifice that passes more empties sooner.
     return PumpCoefficients(
-        int(plant[16]), plant[17] * lag, plant[18] * deflation, plant[19] / deflation, plant[20] / deflation
-    )
+        int(plant[16]), plant[17 + 4 * side] * lag, plant[18] * deflation, plant[19] / deflation,
+        plant[20] / deflation,
+    )  # fmt: skip
 
 
 _FELT = (12, 13, 14, 19, 20)
@@ -283,7 +284,7 @@ def _pump_rows(
     x : as in `jacobian`. y : (12,) of `MOVING`. to : nominal static force [N].
     """
     lag, force, strength = y[6 + side], y[8 + side], _factor(x[15 + side])
-    pump = _pump(plant, _factor(x[17]), _factor(x[18]))
+    pump = _pump(plant, side, _factor(x[17]), _factor(x[18]))
     decay = math.exp(-0.5 * h / pump.lag_s)
     own, middle, end = advance_pump(pump, lag, force, strength * to, decay, h)
     y[6 + side] = own
@@ -291,7 +292,7 @@ def _pump_rows(
     middle_row, end_row = _MIDDLE + side * _L, _END + side * _L
     for n in range(5):
         step = _NUDGES[n]
-        other = _pump(plant, _factor(x[17] + step * (n == 3)), _factor(x[18] + step * (n == 4)))
+        other = _pump(plant, side, _factor(x[17] + step * (n == 3)), _factor(x[18] + step * (n == 4)))
         settled = _factor(x[15 + side] + step * (n == 2)) * to
         fades = math.exp(-0.5 * h / other.lag_s) if n == 3 else decay
         a, b, c = advance_pump(other, lag + step * (n == 0), force + step * (n == 1), settled, fades, h)
@@ -352,7 +353,7 @@ def jacobian(
 
     Parameters
     ----------
-    plant : (21,) of `PLANT`.
+    plant : (22,) of `PLANT`.
     x : (23,) or more, of `DRIVEN`.
     segments : (count, 3) or more rows: duration [s] and the nominal static forces of both pumps [N].
     longest_s : step. w : (`FLOW`,) scratch.
@@ -524,8 +525,9 @@ class Drive(Machine):
     covariance: FloatArray | None = None
 
     def numbers(self) -> FloatArray:
-        """The (21,) vector of `PLANT`."""
-        return np.array([*coefficients(self.plant), *pump_coefficients(self.pump)], dtype=np.float64)
+        """The (22,) vector of `PLANT`."""
+        one, two = pump_coefficients(self.pump)
+        return np.array([*coefficients(self.plant), *one, two.lag_s], dtype=np.float64)
 
     def noise(self, setup: Setup) -> FloatArray:
         """The (11,) of `event.NOISE` for the driven filter."""
@@ -588,7 +590,7 @@ class Switches(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What does not change: start (37,), (37, 37), plant (21,), walk, the camera's view, noise, and numbers.
+    """What does not change: start (37,), (37, 37), plant (22,), walk, the camera's view, noise, and numbers.
 
     Attributes
     ----------

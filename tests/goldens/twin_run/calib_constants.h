@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x8F2D7A17UL
+#define CALIB_ID 0xE8C96EBDUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -222,7 +222,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0649771839f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0649763271f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -237,26 +237,26 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.5141995f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000256102649f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.80615881e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 1.59040046e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.79055325e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.00025693691f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -9.10214021e-06f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00251713372f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000256588566f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000256110157f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.80629978e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 1.59044703e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.79069377e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000256944448f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -9.10240669e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00251720753f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000256596075f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00827067066f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.96098401e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.373642176f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.26441383f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5288277f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00252484623f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.188034222f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00686484575f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00904291216f /* K_r, dimensionless */
+#define CALIB_FUSED_PHI_PER_M 0.37364164f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.26446104f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5289221f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252484414f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.188034281f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00686484855f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00904291589f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.00036957406f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000369573914f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -309,19 +309,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0649771839f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0649763271f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.246323f, 139.744873f, 149.1828f, 157.620743f, 165.535614f,
-    173.180573f, 180.713715f, 188.301575f, 196.110825f, 204.353607f, 213.40184f,
-    224.075165f, 241.513458f, 253.5f,
+    99.75f, 128.232819f, 139.725494f, 149.158203f, 157.591812f, 165.502686f,
+    173.142319f, 180.670914f, 188.252533f, 196.054474f, 204.288086f, 213.31955f,
+    223.963242f, 241.172821f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0449771844f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.114977181f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0449763276f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.114976324f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
