@@ -150,6 +150,7 @@ def fleet(
 def _as_json(summary: FleetSummary, as_before: int) -> dict[str, Any]:
     return {
         "rigs": summary.rigs,
+        "simulated": summary.simulated,
         "verdicts": summary.verdicts,
         "as_before": as_before,
         "stages": summary.stages,
@@ -178,7 +179,9 @@ _MOST_TOLD = 20
 
 def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
     words = ", ".join(f"{count} {verdict}" for verdict, count in summary.verdicts.items())
-    say(f"{counted(summary.rigs, 'rig')}: {words}" + (f"; {as_before} as before" if as_before else ""))
+    simulated = f"; simulated: {summary.simulated}" if summary.simulated else ""
+    before = f"; {as_before} as before" if as_before else ""
+    say(f"{counted(summary.rigs, 'rig')}: {words}{simulated}{before}")
     rows = []
     for one in summary.constants:
         if one.standing_out or one.drifts:

@@ -525,6 +525,7 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
     decision = done.decision
     if kind == "run" and decision.lacking and not decision.failed:
         reasons = (decision.lacking, *reasons)
+    rig = Rig.load(done.out / "rig.yaml")
     outcome = Outcome(
         name=spec.name,
         status=_STATUS.get(code, "failed"),
@@ -534,7 +535,8 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
         kind=kind,
         reasons=reasons,
         stages={job.name: job.status for job in done.ended},
-        values=_values(done.out / "rig.yaml"),
+        simulated=rig.simulated,
+        values={f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(rig.values())},
         files={name: sha256(data) for name, data in files.items()},
     )
     return Answer(outcome, files)
@@ -550,10 +552,6 @@ def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
             if total <= _MOST_KEPT_BYTES:
                 files[name] = data
     return files
-
-
-def _values(rig: Path) -> dict[str, tuple[float, float | None]]:
-    return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(Rig.load(rig).values())}
 
 
 def peak_memory_MB() -> float:
@@ -632,11 +630,11 @@ def finish(store: Store, manifest: Manifest) -> FleetSummary:
     return summary
 
 
-# Columns: name, serial, source, kind, verdict, code, sentence, reasons, `verdict.STAGE` for each stage,
-# `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and outlier_of, the
-# constant that stands out most against the fleet. A rig without a number has a null there.
+# Columns: name, serial, source, kind, simulated, verdict, code, sentence, reasons, `verdict.STAGE` for each
+# stage, `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and outlier_of,
+# the constant that stands out most against the fleet. A rig without a number has a null there.
 
-_FIRST = ("name", "serial", "source", "kind", "verdict", "code", "sentence", "reasons")
+_FIRST = ("name", "serial", "source", "kind", "simulated", "verdict", "code", "sentence", "reasons")
 _MOST_COLUMNS = 8000
 
 
@@ -645,7 +643,7 @@ def table_of(rigs: Iterable[tuple[RigSpec, Outcome]]) -> Any:
     whole = arrow_table((_row_of(rig, outcome) for rig, outcome in rigs), _FIRST)
     verdicts = [name for name in whole.column_names if name.startswith("verdict.")]
     constants = [name for name in whole.column_names if name not in (*_FIRST, *verdicts)]
-    kinds = dict.fromkeys([*_FIRST, *verdicts], "string") | {"code": "int16"}
+    kinds = dict.fromkeys([*_FIRST, *verdicts], "string") | {"code": "int16", "simulated": "bool"}
     return typed(whole, [*_FIRST, *verdicts, *constants[:_MOST_COLUMNS]], kinds)
 
 
@@ -655,6 +653,7 @@ def _row_of(rig: RigSpec, outcome: Outcome) -> dict[str, Any]:
         "serial": rig.serial,
         "source": without_secrets(rig.source),
         "kind": outcome.kind,
+        "simulated": outcome.simulated,
         "verdict": outcome.status,
         "code": outcome.code,
         "sentence": outcome.sentence,
@@ -920,13 +919,14 @@ class FleetSummary:
 
     Attributes
     ----------
-    verdicts : rigs by verdict. stages : of each stage the rigs by verdict.
+    simulated : how many rigs are. verdicts : rigs by verdict. stages : of each stage the rigs by verdict.
     constants : in the order of the file. looks : the rigs to look at, the worst first, no more than 200.
     to_look_at : how many there are.
     numbered : rigs whose serial has a number. limit : |z| beyond which one stands out, NaN for too few rigs.
     """
 
     rigs: int
+    simulated: int
     verdicts: dict[str, int]
     stages: dict[str, dict[str, int]]
     constants: tuple[ConstantSummary, ...]
@@ -982,6 +982,7 @@ def summarise(table: Any) -> tuple[FleetSummary, FloatArray, list[str | None]]:
     looks, to_look_at = _looks(names, serials, verdicts, texts(table, "sentence"), worst, which, limit)
     summary = FleetSummary(
         rigs,
+        sum(table["simulated"].to_pylist()),
         dict(sorted(Counter(verdicts).items(), key=lambda pair: _ORDER.get(pair[0], 2))),
         stages,
         tuple(constants),

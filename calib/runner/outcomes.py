@@ -59,6 +59,7 @@ class Outcome(BaseModel):
     key : of all that the result follows from, "" where that is not known.
     kind : of a rig "run" for all stages, "camera" for those of a camera.
     reasons : of stages that are not ok. stages : outcome of each stage by its name.
+    simulated : whether constants come from a simulated rig or from rendered pictures.
     values : numbers with their standard deviations by name; null for what did not happen.
     seconds, peak_MB : spent on it, and the process's largest memory meanwhile.
     files : SHA-256 of its results by name.
@@ -74,6 +75,7 @@ class Outcome(BaseModel):
     kind: str = ""
     reasons: tuple[Sentence, ...] = ()
     stages: dict[str, str] = {}
+    simulated: bool = False
     values: Mapping[str, tuple[float | None, float | None]] = {}
     seconds: float = 0.0
     peak_MB: float | None = None

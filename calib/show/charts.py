@@ -136,8 +136,9 @@ def _edges(sizes: Sequence[float]) -> list[float]:
 
 
 def _words(text: str) -> str:
-    """Text of any origin as plotly writes it: its signs, and no element."""
-    return html.escape(text.encode("utf-8", "backslashreplace").decode("utf-8"), quote=False)
+    """Text of any origin as plotly writes it: its signs and lines, and no element."""
+    safe = html.escape(text.encode("utf-8", "backslashreplace").decode("utf-8"), quote=False)
+    return safe.replace("\n", "<br>")
 
 
 def _colour(which: Colour) -> str:

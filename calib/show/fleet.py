@@ -16,6 +16,7 @@ from calib.core.verdict import POOR
 from calib.core.words import BLANK, SIGMA, as_words, counted, number, several
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
+from calib.runner.graph import STEPS
 from calib.runner.sweep import Point, Sweep, SweepSummary
 from calib.show.page import PAGE as A_PAGE
 from calib.show.page import embedded, render
@@ -94,13 +95,14 @@ def write_fleet_page(path: Path, summary: FleetSummary) -> None:
 
 def fleet_page_text(summary: FleetSummary) -> str:
     """The whole page."""
-    told = sorted(summary.constants, key=_interest)
+    # Of a constant of one rig there is nothing to draw.
+    told = sorted((one for one in summary.constants if one.spread.count > 1), key=_interest)
     answer, headline = _answer(summary)
     return render(
         "fleet.html.j2",
         STYLE,
         SCRIPT,
-        bool(summary.constants),
+        bool(told),
         version=__version__,
         summary=summary,
         rigs=counted(summary.rigs, "rig"),
@@ -111,7 +113,7 @@ def fleet_page_text(summary: FleetSummary) -> str:
         ],
         stages=_stages(summary),
         cards=[_card(one) for one in told[:_MOST_DRAWN]],
-        dropped=max(0, len(told) - _MOST_DRAWN),
+        dropped=len(summary.constants) - len(told[:_MOST_DRAWN]),
         rows=[_row(one) for one in summary.constants],
         looks=[(look, _KIND.get(look.verdict, "skipped"), _z(look.z)) for look in summary.looks],
         limit=f"{summary.limit:.2f}" if math.isfinite(summary.limit) else "",
@@ -151,9 +153,16 @@ def _z(value: float | None) -> str:
 
 def _stages(summary: FleetSummary) -> list[tuple[str, list[tuple[str, int, str]]]]:
     return [
-        (stage, [(v, n, _STAGE_KIND.get(v, "skipped")) for v, n in sorted(counts.items())])
+        (_title(stage), [(v, n, _STAGE_KIND.get(v, "skipped")) for v, n in sorted(counts.items())])
         for stage, counts in summary.stages.items()
     ]
+
+
+def _title(job: str) -> str:
+    """A job's title from its name: that of its stage, and of its log where there are several."""
+    step = max((one for one in STEPS if f"{job}-".startswith(f"{one.name}-")), key=lambda one: len(one.name))
+    log = job.removeprefix(step.name).removeprefix("-")
+    return f"{step.title} of {log}" if log else step.title
 
 
 def _facts(one: ConstantSummary) -> list[tuple[str, str]]:

@@ -354,7 +354,7 @@ def _stage(
         "parts": parts,
         "tables": _over_all(parts) if len(parts) > 1 else [],
         "several": len(parts) > 1,
-        "flashed": bool(jobs[0]["flashed"]),
+        "flashed": bool(jobs[0]["flashed"]) and status in WORDS,
     }
 
 

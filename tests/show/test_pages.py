@@ -422,7 +422,10 @@ def test_whole_harmless_and_told() -> None:
 
 def test_a_fleet_of_one_rig() -> None:
     text = fleet_page_text(_summary(1, 1))
-    assert "Fleet of 1 rig<" in text and "over 1 rig" in text
+    assert "Fleet of 1 rig<" in text and "2 more constants are in the table only" in text
+    assert "<td>Camera</td>" in text and "Simulated." not in text
+    rigs = [(RigSpec(f"rig{k}", "/x"), Outcome(name=f"rig{k}", simulated=k > 0)) for k in range(3)]
+    assert "2 of 3 rigs are simulated" in fleet_page_text(summarise(table_of(rigs))[0])
     assert "1 rigs" not in text.replace(library(), "")
 
 

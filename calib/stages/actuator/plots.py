@@ -23,10 +23,10 @@ from calib.core.plot import (
     number,
     short,
 )
-from calib.stages.actuator.identify import PARAMETERS, autocorrelation
+from calib.stages.actuator.identify import autocorrelation
 from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound
 from calib.stages.actuator.results import Identified, simulated_heads
-from calib.stages.actuator.section import Actuator, PumpSection
+from calib.stages.actuator.section import Actuator, PumpSection, label_of
 from calib.stages.actuator.stage import Springs, Validated
 from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
@@ -123,7 +123,7 @@ def _parameters(result: Identified) -> Figure:
     for one, (hue, kind) in zip(result.prospects, _PROSPECTS, strict=False):
         after = 100.0 * np.array([one.relative.get(name, np.nan) for name in names])
         marks.append(Curve(after, np.arange(len(names)), one.name, kind, hue, 5.0))
-    labels = tuple(f"{name} ({PARAMETERS[name].symbol})" for name in names)
+    labels = tuple(map(label_of, names))
     title = f"What is known of the parameters ({SIGMA} / value)"
     panel = Plot("%", "", marks, grid="x", names=labels)
     return Figure(title, note, (panel,), 1.1 + 0.36 * len(names))
@@ -142,7 +142,7 @@ def _damping(result: Identified) -> Figure:
             )
             top = 1.3 * float(np.abs(d.peak).max())
             fitted = "" if of_fit is None else f", that of the fit {of_fit:.4f}"
-            title = f"{short(track.name, 30)}: zeta {d.zeta:.4f} +- {d.sigma:.1g}{fitted}"
+            title = f"{short(track.name, 30)}: zeta {d.zeta:.4f} \N{PLUS-MINUS SIGN} {d.sigma:.1g}{fitted}"
             panels.append(Plot("time (s)", "angle (rad)", marks, title, y_limits=(-top, top)))
     whole = panels or (Plot(empty="no free swing with enough peaks"),)
     return Figure("Damping by peaks", note, whole, 2.1 * len(whole))

@@ -372,6 +372,11 @@ _RUNS = range(4, 11)
 _FEWEST_RUNS = 20
 _REST_PX = 0.3
 """Step from frame to frame below which a codec may send nothing anew."""
+_STRIDES = (1, 2, 4, 8)
+"""Frames from one to the next of a run: a codec carries an error on."""
+_WALK = 1.8
+"""Growth of the scatter with twice the stride up to which it is an error that is carried on: 1.41 of a random
+walk, somewhat more of medians over few runs. Of a vibration with too few frames it is larger."""
 _SETTLED = 0.85
 """Of the differences of one order less, from which on they are noise: those of a motion fall by more."""
 
@@ -401,9 +406,10 @@ def scatter_px(centres_px: FloatArray, times_s: FloatArray) -> FloatArray:
 
     It sees what edges do not tell, as a codec that moves the whole marker. Differences from the third to
     the ninth are tried, and the least counts of those that fall no more with their order, as those of a
-    motion do. Frames at rest, in slow and in fast motion are apart, as a codec moves what moves; at rest it
-    repeats an error, so that they scatter as those in slow motion. Frames may be as uneven as their times
-    say, or even with times that are not. 0 where the track does not tell, as in few frames.
+    motion do. Runs of every second, fourth and eighth frame see errors that last. Frames at rest, in slow
+    and in fast motion are apart, as a codec moves what moves; at rest it repeats an error, so that they
+    scatter as those in slow motion. Frames may be as uneven as their times say, or even with times that are
+    not. 0 where the track does not tell, as in few frames.
 
     Parameters
     ----------
@@ -415,38 +421,44 @@ def scatter_px(centres_px: FloatArray, times_s: FloatArray) -> FloatArray:
     fast = moving & (step > (np.median(step[moving]) if moving.any() else 0.0))
     if fast.sum() < 2 * _FEWEST_RUNS:
         fast[:] = False
-    found = np.zeros(len(step))
+    groups = ~moving, moving & ~fast, fast
     even_s = np.arange(len(step), dtype=np.float64)
-    differences = [[_differences(centres_px, t, run) for run in _RUNS] for t in (times_s, even_s)]
+    levels, goes_on = [0.0] * len(groups), [True] * len(groups)
+    for stride in _STRIDES:
+        differences = [[_differences(centres_px, t, run, stride) for run in _RUNS] for t in (times_s, even_s)]
+        for k, group in enumerate(groups):
+            settled = [least for each in differences if (least := _settled(each, group, stride)) > 0.0]
+            level = min(settled, default=0.0)
+            goes_on[k] &= stride == 1 or 0.0 < level < _WALK * levels[k]
+            if goes_on[k]:
+                levels[k] = max(levels[k], level)
+    rest, slow, _ = levels
+    return np.asarray(np.select(groups, (max(rest, slow), *levels[1:])))
 
-    def scatter(group: BoolArray) -> float:
-        return min((least for each in differences if (least := _settled(each, group)) > 0.0), default=0.0)
 
-    for group in (slow := moving & ~fast, fast):
-        found[group] = scatter(group)
-    rest = ~moving
-    found[rest] = max(scatter(rest), float(found[slow].max(initial=0.0)))
-    return found
-
-
-def _differences(centres_px: FloatArray, times_s: FloatArray, run: int) -> FloatArray:
-    """Divided differences (n - run + 1, 2) of runs of frames, of the size of a coordinate's noise."""
-    windows = np.lib.stride_tricks.sliding_window_view
-    if len(times_s) < run:
+def _differences(centres_px: FloatArray, times_s: FloatArray, run: int, stride: int) -> FloatArray:
+    """Divided differences (m, 2) of runs of frames a stride apart, of the size of a coordinate's noise."""
+    span = (run - 1) * stride + 1
+    if len(times_s) < span:
         return np.zeros((0, 2))
-    t = windows(times_s, run)
+
+    def windows(values: FloatArray) -> FloatArray:
+        return np.lib.stride_tricks.sliding_window_view(values, span, axis=0)[..., ::stride]
+
+    t = windows(times_s)
     weights = np.stack(
         [1.0 / np.prod([t[:, i] - t[:, j] for j in range(run) if j != i], axis=0) for i in range(run)], axis=1
     )
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
-    return np.asarray((windows(centres_px, run, axis=0) * weights[:, None]).sum(axis=2))
+    return np.asarray((windows(centres_px) * weights[:, None]).sum(axis=2))
 
 
-def _settled(differences: Sequence[FloatArray], group: BoolArray) -> float:
+def _settled(differences: Sequence[FloatArray], group: BoolArray, stride: int) -> float:
     """The least scatter, of runs about a group's frames, that falls no more with the order; else 0."""
     scatters = []
     for run, each in zip(_RUNS, differences, strict=True):
-        about = each[group[run // 2 : run // 2 + len(each)]]
+        middle = ((run - 1) * stride + 1) // 2
+        about = each[group[middle : middle + len(each)]]
         known = about[np.isfinite(about).all(axis=1)]
         scatters.append(1.4826 * float(np.median(np.abs(known))) if len(known) >= _FEWEST_RUNS else np.nan)
     return min((b for a, b in pairwise(scatters) if b > _SETTLED * a), default=0.0)
