@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
 from calib.core.result import CovarianceTable
@@ -215,24 +216,21 @@ def _rig(rng: np.random.Generator, name: str, fx_px: float | None = None, verdic
 
 @contextmanager
 def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
-    from calib.runner.fleet import _values
-
     with opened_store(out, "calib fleet", ()) as (store, _):
         for name, rig in rigs.items():
             text = rig.text().encode()
             assert rig.camera is not None
-            scratch = out / "one.yaml"
-            scratch.write_bytes(text)
             poor = not rig.camera.verdict.ok
             outcome = Outcome(
                 name=name,
                 status="poor" if poor else "ok",
                 code=int(poor),
                 key="k",
-                values=_values(scratch),
+                values={
+                    f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(rig.values())
+                },
                 files={"rig.yaml": sha256(text)},
             )
-            scratch.unlink()
             store.keep(Answer(outcome, {"rig.yaml": text}))
         yield store, Manifest(tuple(RigSpec(name, "/x") for name in rigs), ())
 
