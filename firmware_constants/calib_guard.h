@@ -125,7 +125,7 @@ static inline void calib_guard_fault(calib_guard *guard, uint8_t fault) {
     if (guard->state == CALIB_FAULT && (guard->fault >= CALIB_FAULT_STAYS || fault == CALIB_FAULT_REFERENCE)) {
         return;
     }
-    if (guard->state != CALIB_FAULT && fault != CALIB_FAULT_REFERENCE && guard->tries < 255) {
+    if (guard->state != CALIB_FAULT && fault != CALIB_FAULT_REFERENCE) {
         guard->tries++;
     }
     guard->state = CALIB_FAULT;
@@ -466,7 +466,7 @@ static inline uint16_t calib_guard_try(calib_trial *of, uint8_t fault, uint8_t k
         case CALIB_FAULT_REFERENCE:
             if (kind > 2) {
                 mode = CALIB_MODE_OPEN;
-                of->in.reference[1] = -1.0f;
+                of->in.reference[kind - 3u] = -1.0f;
             } else if (kind > 1) {
                 mode = CALIB_MODE_ORIENTATION;
                 of->in.reference[0] = 1.1f * CALIB_ENVELOPE_ANGLE_RAD;
@@ -512,15 +512,18 @@ static inline uint16_t calib_guard_try(calib_trial *of, uint8_t fault, uint8_t k
                 (of->guard.state == CALIB_FAULT) != (fault != CALIB_FAULT_REFERENCE)) {
                 return 0;
             }
-            again = calib_trial_until(of, 140);
             if (fault >= CALIB_FAULT_STAYS) {
-                if (again != 0xFFFFu) {
+                calib_guard_fault(&of->guard, CALIB_FAULT_LATE);
+                if (calib_trial_until(of, 140) != 0xFFFFu) {
                     return 0;
                 }
                 calib_guard_clear(&of->guard);
-                again = calib_trial_until(of, 140);
             }
-            return of->guard.fault == CALIB_FAULT_NONE ? (uint16_t)(k + 256u * again) : 0;
+            again = calib_trial_until(of, 140);
+            if (of->guard.fault != CALIB_FAULT_NONE || of->guard.tries != (fault < CALIB_FAULT_REFERENCE)) {
+                return 0;
+            }
+            return (uint16_t)(k + 256u * again);
         }
     }
     return 255;
@@ -538,7 +541,14 @@ static inline uint8_t calib_guard_patient(calib_trial *of) {
     if (calib_trial_once(of, CALIB_MODE_OFF) || calib_trial_until(of, 1)) {
         return 0;
     }
+    /* Where nothing is wrong, to clear is nothing. */
+    calib_guard_clear(&of->guard);
+    if (calib_trial_until(of, 1)) {
+        return 0;
+    }
     for (wait = 60; wait < 1000; wait = (uint16_t)(2u * wait)) {
+        /* Twice is once. */
+        calib_guard_fault(&of->guard, CALIB_FAULT_LATE);
         calib_guard_fault(&of->guard, CALIB_FAULT_LATE);
         of->guard.quiet = (uint16_t)(wait - 5u);
         if (calib_trial_until(of, 10) != 5) {
@@ -566,13 +576,18 @@ static inline uint8_t calib_guard_patient(calib_trial *of) {
     }
     tries = of->guard.tries;
     (void)calib_trial_until(of, 1);
-    return tries == 1 && of->guard.tries == 0;
+    if (tries != 1 || of->guard.tries != 0) {
+        return 0;
+    }
+    calib_guard_ready(&of->guard, 0);
+    calib_guard_clear(&of->guard);
+    return of->guard.fault == CALIB_FAULT_SELFTEST;
 }
 
 /* 0 when every fault stops the pumps in its tick and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
     /* Fault, kind, tick, ticks until it is over. The last is not of the fused estimator, which always needs the camera. */
-    static const uint8_t tries[24][4] = {
+    static const uint8_t tries[25][4] = {
         {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
         {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_IMU_FROZEN, 1, 35, 61},
         {CALIB_FAULT_IMU_FROZEN, 2, 37, 63},
@@ -582,6 +597,7 @@ static inline uint8_t calib_guard_selftest(void) {
         {CALIB_FAULT_APART, 0, 30, 62},         {CALIB_FAULT_APART, 1, 30, 62},
         {CALIB_FAULT_REFERENCE, 0, 1, 28},      {CALIB_FAULT_REFERENCE, 1, 1, 28},
         {CALIB_FAULT_REFERENCE, 2, 1, 28},      {CALIB_FAULT_REFERENCE, 3, 1, 28},
+        {CALIB_FAULT_REFERENCE, 4, 1, 28},
         {CALIB_FAULT_REACH, 0, 6, 30},          {CALIB_FAULT_REACH, 1, 6, 30},
         {CALIB_FAULT_RATE, 0, 11, 30},          {CALIB_FAULT_RATE, 1, 11, 30},
         {CALIB_FAULT_FULL_POWER, 0, 4, 30},     {CALIB_FAULT_FULL_POWER, 1, 4, 30},
@@ -589,12 +605,12 @@ static inline uint8_t calib_guard_selftest(void) {
         {CALIB_FAULT_NONE, 0, 1, 0}};
     static calib_trial trial;
     uint8_t i;
-    for (i = 0; i < (CALIB_FUSED ? 23 : 24); i++) {
+    for (i = 0; i < (CALIB_FUSED ? 24 : 25); i++) {
         if (calib_guard_try(&trial, tries[i][0], tries[i][1]) != tries[i][2] + 256u * tries[i][3]) {
             return (uint8_t)(i + 1u);
         }
     }
-    return calib_guard_patient(&trial) ? 0 : 25;
+    return calib_guard_patient(&trial) ? 0 : 26;
 }
 
 #ifdef __cplusplus

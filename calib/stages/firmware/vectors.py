@@ -90,7 +90,19 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
 _TO_LIMIT = 30
 
 
-def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs, int]]:
+def _weak(c: Mapping[str, float], factor: float, fused: bool) -> dict[str, Any]:
+    """Readings at a factor of the specific force below which there is none to go by."""
+    rows, limit = np.eye(2), c["CALIB_IMU_ACCEL_WEAK_MPS2"]
+    offset = np.array([c["CALIB_IMU_ACCEL_BIAS_X_MPS2"], c["CALIB_IMU_ACCEL_BIAS_Y_MPS2"]])
+    if fused:
+        rows = np.array([[c[f"CALIB_FUSED_ACCEL_{i}{j}"] for j in (1, 2)] for i in (1, 2)])
+        offset = np.array([c["CALIB_FUSED_ACCEL_1"], c["CALIB_FUSED_ACCEL_2"]])
+        limit = c["CALIB_FUSED_ACCEL_WEAK"]
+    ax, ay = np.linalg.solve(rows, offset + np.array([factor * limit, 0.0])).tolist()
+    return {"ax_mps2": c["CALIB_IMU_SIGN_AX"] * ax, "ay_mps2": c["CALIB_IMU_SIGN_AY"] * ay}
+
+
+def _limits(constants: Mapping[str, float], still: Inputs, fused: bool) -> list[tuple[Inputs, int]]:
     """Ticks on either side of what is refused, with how often each comes: losses, NaN, readings beyond.
 
     Parameters
@@ -103,16 +115,15 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     made: list[tuple[Inputs, int]] = []
     for silent in (replace(still, marker_seen=False), replace(still, imu_read=False)):
         made += [(still, 2), (silent, hold), (silent, 1), (still, 1)]
+    # The angle begins anew in the very tick in which its controller does.
+    near = (Reference(constants).step(still).phi_rad + 0.05, 0.0)
+    silent = replace(still, marker_seen=False, imu_read=False, mode=MODE_ORIENTATION, reference=near)
+    made += [(silent, hold + 1), (replace(silent, imu_read=True), 1)]
     # A picture that is left out is none, and the pumps do not go on for it.
     boost = int(constants.get("CALIB_FUSED_BOOST_TICKS", 0))
     away = replace(still, u_px=_elsewhere(still.u_px))
     lost = replace(still, marker_seen=False, mode=MODE_OFF)
     made += [(still, boost + 2), (lost, hold - 1), (away, 2), (still, 1)]
-    weak = {
-        f"a{axis}_mps2": 0.9 * constants["CALIB_IMU_ACCEL_WEAK_MPS2"]
-        + constants[f"CALIB_IMU_ACCEL_BIAS_{name}"]
-        for axis, name in (("x", "X_MPS2"), ("y", "Y_MPS2"))
-    }
     edge = constants.get("CALIB_CAMERA_GREATEST_U_PX", 0.0), constants.get("CALIB_CAMERA_GREATEST_V_PX", 0.0)
     changes: list[dict[str, Any]] = [
         *({name: nan} for name in ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")),
@@ -122,15 +133,19 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
         {"u_px": edge[0] - 0.01, "v_px": edge[1] - 0.01},
         *({name: 158.0} for name in ("ax_mps2", "ay_mps2")),
         *({"gz_radps": value} for value in (-35.1, 35.1)),
-        *({"reference": pair} for pair in ((nan, 0.08), (0.08, nan), (6.31, 0.08), (0.08, -6.31))),
-        weak,
+        *({"reference": pair} for pair in ((nan, 0.08), (6.31, 0.08), (0.08, -6.31))),
+        *(_weak(constants, factor, fused) for factor in (0.995, 1.005)),
         {"mode": 7},
     ]
     for k, change in enumerate(changes):
         made += [(replace(still, **change), 1), *[(still, 1)] * (k % 3 == 2)]
     # At rest, and then a little beside: told from a motion.
     steady = replace(still, gz_radps=constants["CALIB_IMU_GYRO_BIAS_RADPS"], mode=MODE_OFF)
-    made += [(steady, 150), (replace(steady, v_px=still.v_px + 0.5), 3)]
+    made.append((steady, 150))
+    if fused:
+        # Not yet a motion, for about as long as the gain at rest takes.
+        made.append((_farther(constants, steady, 0.8 * constants["CALIB_FUSED_MOVING_M"]), 110))
+    made.append((replace(steady, v_px=still.v_px + 0.5), 3))
     half = constants["CALIB_ORIENTATION_KI_HALF_DT_PWM_PER_RAD"]
     if half > 0.0 and constants["CALIB_ORIENTATION_CLAMPING"]:
         # The integral comes to the limit within `_TO_LIMIT` ticks, and is left out from there.
@@ -153,20 +168,24 @@ def _limits(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     return [(binary32(given), times) for given, times in made]
 
 
+def _farther(constants: Mapping[str, float], still: Inputs, by_m: float) -> Inputs:
+    """The tick with the marker farther out; as it is where it is not seen."""
+    reference = Reference(constants)
+    seen = reference.step(still)
+    if seen.flags & MARKER_HELD:
+        return still
+    (X, Y), out = seen.marker_m, 1.0 + by_m / math.hypot(*seen.marker_m)
+    u, v = pixel_of(reference, out * X, out * Y, (still.u_px, still.v_px))
+    return binary32(replace(still, u_px=u, v_px=v))
+
+
 def _bent(constants: Mapping[str, float], run: list[Inputs]) -> list[tuple[Inputs, int]]:
     """The run's most bent tick for long, which adds up what the accelerometer's biases leave, and then the
     marker farther out by less than the gate, whose mean residual is a motion.
     """
     bent = max(run, key=lambda one: abs(one.ay_mps2))
     still = binary32(replace(bent, gz_radps=constants["CALIB_IMU_GYRO_BIAS_RADPS"], mode=MODE_OFF))
-    reference = Reference(constants)
-    seen = reference.step(still)
-    if seen.flags & MARKER_HELD:
-        return [(still, 150)]
-    out = 1.0 + 0.8 * constants["CALIB_FUSED_GATE_M"] / math.hypot(*seen.marker_m)
-    X, Y = seen.marker_m
-    u, v = pixel_of(reference, out * X, out * Y, (still.u_px, still.v_px))
-    return [(still, 150), (binary32(replace(still, u_px=u, v_px=v)), 3)]
+    return [(still, 150), (_farther(constants, still, 0.8 * constants["CALIB_FUSED_GATE_M"]), 3)]
 
 
 def vectors(
@@ -191,7 +210,7 @@ def vectors(
         weightless = binary32(replace(silent, imu_read=True, ax_mps2=0.1, ay_mps2=-0.1))
         # The angle is known before the first picture.
         unseen = replace(run[0], marker_seen=False)
-        given = [(silent, 1), (weightless, 1), (unseen, 1), *given, *_limits(constants, still)]
+        given = [(silent, 1), (weightless, 1), (unseen, 1), *given, *_limits(constants, still, fused)]
         if fused:
             given += _bent(constants, coherent(constants, ticks, period=ticks))
     made = []
@@ -227,7 +246,7 @@ def _points(constants: Mapping[str, float]) -> list[list[float]]:
         2.0 * REFERENCE_LIMIT,
     )
     rows = []
-    for share in (1.0, -0.6, 0.3):
+    for share in (1.0, -0.6):
         x = float(np.float32(share * rest))
         rows.append([x, rest, *inverse(np.array([x, rest, 2.0 * math.atan2(x, rest)]), radius).tolist()])
     beyond = ((1.01 * rest, rest), (0.0, -rest), (0.0, 6.31), (0.0, _NAN))
