@@ -12,9 +12,11 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, blocks, robust_sigma
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
+from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.allan import KINDS, LEAST_SAMPLES, Allan, analyse, model_variance
+from calib.stages.imu.levelling import Levelling
 from calib.stages.imu.sampling import (
     Motion,
     Readings,
@@ -299,6 +301,8 @@ _GRAVITY_MPS2, _MOST_OFF_GRAVITY = 9.81, 0.15
 """Cheap accelerometers are off by a few per cent in scale and some 0.08 g in bias."""
 _COLOURED = 2.0
 """Deviation over the fitted one, or this over that, from which on N, B and K do not describe the noise."""
+_COLOURED_RAD, _LEARNT_S = math.radians(0.1), Levelling.bias_tau_s
+"""What that is to make of an angle, for as long as a bias lasts until a filter has learnt it."""
 _LONG_S = 7200.0
 """A log that shows no random walk within this will hardly do so within the next hours."""
 _MOST_REPEATED = 0.02
@@ -439,10 +443,10 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
             _AGAIN,
         )
     if allan.chance < _LEAST_CHANCE:
-        off, tau_s = _colour(allan)
+        off, tau_s, turns_rad = _colour(allan, axis[0] == "g")
         text = f"{axis}: its noise is coloured, at {tau_s:.2g} s the deviation is {off:.2g} times what white "
         text += "noise, flicker and a random walk explain"
-        if not 1.0 / _COLOURED <= off <= _COLOURED:
+        if turns_rad > _COLOURED_RAD:
             yield Finding("poor", f"{text}; N, B and K do not describe it")
         else:
             trusts = "far" if off > 1.0 else "little"
@@ -456,8 +460,11 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
         )
 
 
-def _colour(allan: Allan) -> tuple[float, float]:
-    """Deviation over the fitted one where they differ most, of what is sure of it, and the time of that."""
+def _colour(allan: Allan, gyro: bool) -> tuple[float, float, float]:
+    """Deviation over the fitted one where that differs most for sure, and its time.
+
+    And what is beyond `_COLOURED` times makes of an angle at most [rad].
+    """
     first, last = allan.fit_s
     used = (allan.tau_s > 0.99 * first) & (allan.tau_s < 1.01 * last)
     tau_s, model = allan.tau_s[used], np.sqrt(model_variance(allan.theta, allan.tau_s[used]).sum(axis=1))
@@ -466,7 +473,9 @@ def _colour(allan: Allan) -> tuple[float, float]:
     high = allan.high[used] ** 2 / allan.deviation[used]
     sure = np.where(low > model, low / model, np.where(high < model, high / model, 1.0))
     k = int(np.argmax(np.abs(np.log(sure))))
-    return float(sure[k]), float(tau_s[k])
+    angle = np.abs(sure - 1.0) * model * (np.minimum(tau_s, _LEARNT_S) if gyro else 1.0 / GRAVITY_MPS2)
+    beyond = np.abs(np.log(sure)) > math.log(_COLOURED)
+    return float(sure[k]), float(tau_s[k]), float(angle[beyond].max(initial=0.0))
 
 
 def _of_length(result: Static) -> Iterator[Finding]:
