@@ -30,6 +30,7 @@ from calib.stages.align.solve import (
     Noise,
     Problem,
     Stretch,
+    _centred,
     align,
     best_jitter_px,
     judge,
@@ -268,6 +269,12 @@ def test_a_marker_aside_is_held_by_sigma_or_told(aside_m: float) -> None:
     usual = abs(aside_m) < 1e-4
     assert judge(found).ok == usual
     assert (found.rest_angle_sigma < math.radians(0.06)) == usual
+    # Logs that contradict each other are held by a deviation beyond the prior; the fit was at -2 mm.
+    at = SENSOR.index("shift_x_m")
+    sensor, covariance = found.sensor.copy(), found.covariance.copy()
+    sensor[at], covariance[at, at] = -2e-3, (1.1 * ASIDE_M) ** 2
+    vague = _centred(replace(found, sensor=sensor, covariance=covariance), (5e-5, 1e-5))
+    assert vague.aside_m == pytest.approx((-2e-3, 1.1 * ASIDE_M))
 
 
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:

@@ -1391,7 +1391,10 @@ def _centred(found: Alignment, aside_sigma_m: tuple[float, ...]) -> Alignment:
     centred, weight = _mixed(found, _SHIFT_X, -value, sums, likely)
     if weight[2] < _SURELY_ELSEWHERE:
         return centred
-    told = 1.0 - min(known / wide, 1.0) ** 2
+    # Beyond the prior are deviations that hold what logs contradict each other in.
+    if known > _NOTHING_LEARNT * wide:
+        return replace(centred, aside_m=(value, known))
+    told = 1.0 - (known / wide) ** 2
     return replace(centred, aside_m=(value / told, wide * math.sqrt((1.0 - told) / told)))
 
 
