@@ -89,7 +89,12 @@ class StaticMap(Section):
 
 
 class ComputedTorqueGains(Section):
-    """Horizon and gains of the law, and the observer's gain: rows q1, q2, dq1, dq2, z1, z2, d1, d2, bias."""
+    """Horizon and gains of the law, and the observer's gain: rows q1, q2, dq1, dq2, z1, z2, d1, d2, bias.
+
+    Attributes
+    ----------
+    horizon_ticks : of the law, which `calib control run` has and the firmware has not.
+    """
 
     horizon_ticks: Count
     Kp_per_s2: NotNegative

@@ -83,8 +83,8 @@ class RunOptions:
 
     controllers: tuple[str, ...] | None = option(
         None,
-        "p, pid, clamping, back, pd, pd+ff, pd+map, torque, tuned-pid, tuned-pd; may be repeated. "
-        "[default: all that suit the reference]",
+        "p, pid, clamping, back, pd, pd+ff, pd+map, torque (not in the firmware), tuned-pid, tuned-pd; may "
+        "be repeated. [default: all that suit the reference]",
         flag="controller",
     )
     feedback: Literal["sensors", "truth"] = option(
