@@ -25,12 +25,12 @@ from calib.cli.common import (
 from calib.core.errors import EXIT_POOR
 from calib.core.files import shown
 from calib.core.options import LogOptions, options_of
-from calib.core.stage import Files, Stage
+from calib.core.stage import AnyStage, Files
 from calib.core.words import as_text
 from calib.stages import STAGES, stage
 
 
-def verb(stage: Stage) -> Callable[..., None]:
+def verb(stage: AnyStage) -> Callable[..., None]:
     """The function that typer makes a command of."""
     flags = [one.name for one in fields(stage.options)]
 
@@ -58,7 +58,7 @@ def verb(stage: Stage) -> Callable[..., None]:
     return command
 
 
-def _parameters(stage: Stage) -> list[inspect.Parameter]:
+def _parameters(stage: AnyStage) -> list[inspect.Parameter]:
     kind = inspect.Parameter.KEYWORD_ONLY
     out: list[inspect.Parameter] = []
     if stage.sources:
@@ -134,7 +134,7 @@ def _several(hint: Any) -> Any:
     return hint
 
 
-def _run(stage: Stage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
+def _run(stage: AnyStage, files: Files, options: Any, figures: Path | None, as_json: bool) -> None:
     from calib.runner.work import carry_out
 
     outcome, after = carry_out(stage, files, options, files.rig_path, figures)

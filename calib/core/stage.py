@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVarTuple
 
 from calib.core.errors import BadInputError, CalibError, SomeFailedError, end_of
 from calib.core.files import hash_of, shown
@@ -185,8 +185,11 @@ def _parts(outcome: Any) -> tuple[Result | None, ...]:
     return outcome if isinstance(outcome, tuple) else (outcome,)
 
 
+Inputs = TypeVarTuple("Inputs")
+
+
 @dataclass(frozen=True)
-class Stage:
+class Stage(Generic[*Inputs]):
     """One step of a calibration.
 
     Attributes
@@ -211,8 +214,8 @@ class Stage:
     name: str
     title: str
     summary: str
-    read: Callable[[Files, Rig, Any], tuple[Any, ...]]
-    solve: Callable[..., Any]
+    read: Callable[[Files, Rig, Any], tuple[*Inputs]]
+    solve: Callable[[*Inputs], Any]
     options: type[Any] = NoOptions
     sources: str = ""
     several: bool = True
@@ -350,6 +353,10 @@ class Stage:
     def writes_rig(self, options: Any) -> bool:
         """Whether sections of rig.yaml are written with these options."""
         return bool(self.writes) and (not self.on_request or bool(getattr(options, self.on_request)))
+
+
+AnyStage = Stage[*tuple[Any, ...]]
+"""A stage of which no more is known than that `solve` takes what `read` returns."""
 
 
 def finite(value: Any) -> Any:

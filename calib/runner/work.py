@@ -21,7 +21,7 @@ from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, SomeFailedErr
 from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
-from calib.core.stage import Files, Stage
+from calib.core.stage import AnyStage, Files
 from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
 from calib.runner.cache import BLOCKS
 from calib.stages import stage
@@ -32,7 +32,7 @@ RIG, FIGURES = "rig.yaml", "figures"
 
 
 def carry_out(
-    made: Stage, files: Files, options: Any, rig_path: Path, figures: Path | None = None
+    made: AnyStage, files: Files, options: Any, rig_path: Path, figures: Path | None = None
 ) -> tuple[Any, Rig]:
     """Run a stage and write its sections, its output and its figures; its outcome, and the rig after it.
 
@@ -44,7 +44,7 @@ def carry_out(
 
 
 def _carried_out(
-    made: Stage, files: Files, options: Any, rig_path: Path, figures: Path | None
+    made: AnyStage, files: Files, options: Any, rig_path: Path, figures: Path | None
 ) -> tuple[Any, Rig]:
     if made.writes_rig(options):
         check_writable(rig_path, SECTIONS)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from calib.core.command import one_command
 from calib.core.errors import BadInputError
 from calib.core.options import options_of
-from calib.core.stage import Files, Stage
+from calib.core.stage import AnyStage, Files
 
 if TYPE_CHECKING:
     from calib.core.rig import Rig
@@ -46,9 +46,9 @@ STAGES = {
 """Module of each stage by the words of its verb; the last word is its name there."""
 
 
-def stage(name: str) -> Stage:
+def stage(name: str) -> AnyStage:
     """The stage with this verb."""
-    found: Stage = getattr(importlib.import_module(STAGES[name]), name.split()[-1])
+    found: AnyStage = getattr(importlib.import_module(STAGES[name]), name.split()[-1])
     return found
 
 

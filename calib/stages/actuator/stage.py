@@ -53,7 +53,9 @@ def _with_states(files: Files, options: PoseOptions) -> list[tuple[Path, Path | 
     return [pair for pair in zip(files.named, states, strict=True) if pair[0] in files.paths]
 
 
-def _read(files: Files, rig: Rig, options: LogsOptions) -> tuple[Any, ...]:
+def _read(
+    files: Files, rig: Rig, options: LogsOptions
+) -> tuple[Sequence[Track], Machine, Mapping[str, float], Rig, LogsOptions, Progress]:
     from calib.stages.actuator.read import read_track
     from calib.stages.actuator.results import beginning
 
@@ -206,7 +208,9 @@ class PumpOptions:
     unit: Literal["kPa", "N"] | None = option(None, "Unit of that column.")
 
 
-def _read_pump(files: Files, rig: Rig, options: PumpOptions) -> tuple[Any, ...]:
+def _read_pump(
+    files: Files, rig: Rig, options: PumpOptions
+) -> tuple[Sequence[PumpTable], Sequence[PumpTable], Rig, Progress]:
     """Tables to fit and tables to predict, and the rig with what it holds of a pump."""
     from calib.stages.actuator.read import read_pump_table
 
@@ -335,7 +339,9 @@ class Springs:
     used: int
 
 
-def _read_stiffness(files: Files, rig: Rig, options: StiffnessOptions) -> tuple[Any, ...]:
+def _read_stiffness(
+    files: Files, rig: Rig, options: StiffnessOptions
+) -> tuple[str, FloatArray, FloatArray, Literal["actuator", "bellows"], Rig]:
     from calib.stages.actuator.read import read_displacements
 
     (path,) = files.paths
@@ -435,7 +441,9 @@ class Validated:
     verdict: Verdict = Verdict()
 
 
-def _read_validate(files: Files, rig: Rig, options: ValidateOptions) -> tuple[Any, ...]:
+def _read_validate(
+    files: Files, rig: Rig, options: ValidateOptions
+) -> tuple[Sequence[tuple[Track, Start | None]], Sequence[Trial], Rig]:
     """Tracks of the actuator with the estimator's starts, or trials of an arm, and the rig."""
     from calib.io.columns import is_arm_log
     from calib.io.logs import columns_of

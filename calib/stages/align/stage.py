@@ -35,7 +35,9 @@ _SIGNED = ("ax_mps2", "ay_mps2", "gz_radps")
 """Columns of `geometry.imu_sign`."""
 
 
-def _read(files: Files, rig: Rig, options: AlignOptions) -> tuple[Any, ...]:
+def _read(
+    files: Files, rig: Rig, options: AlignOptions
+) -> tuple[Sequence[AlignLog], Settings, Geometry | None, Mapping[str, int]]:
     from calib.core.rig import Geometry
     from calib.io.logs import read_log
     from calib.stages.align.read import align_log, settings_from_rig

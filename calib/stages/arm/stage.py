@@ -114,7 +114,9 @@ def read_trials(
     return trials, found, (*findings, *frame_findings(found))
 
 
-def _read(files: Files, rig: Rig, options: Options) -> tuple[Any, ...]:
+def _read(
+    files: Files, rig: Rig, options: Options
+) -> tuple[Sequence[Trial], Frame, Sequence[Finding], bool, Progress]:
     del rig
     return *read_trials(files, options), options.compare, files.progress
 

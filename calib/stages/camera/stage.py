@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 # `calib intrinsics`: pictures or a table of correspondences in, the camera with error bars out.
 
 
-def _read_intrinsics(files: Files, rig: Rig, options: IntrinsicsOptions) -> tuple[Any, ...]:
+def _read_intrinsics(
+    files: Files, rig: Rig, options: IntrinsicsOptions
+) -> tuple[ViewSet, IntrinsicsOptions, float]:
     """Views of a target, how to calibrate, and how long it took to find the views."""
     import time
 
@@ -212,7 +214,18 @@ class PlaneEvidence:
     left_out: tuple[LeftOut, ...]
 
 
-def _read_plane(files: Files, rig: Rig, options: NoOptions) -> tuple[Any, ...]:
+def _read_plane(
+    files: Files, rig: Rig, options: NoOptions
+) -> tuple[
+    Camera,
+    Sequence[model.View],
+    tuple[float, float, float, float],
+    Sequence[str],
+    str,
+    tuple[LeftOut, ...],
+    bool,
+    plane.BoardPlace,
+]:
     from calib.core.files import shown
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
@@ -380,7 +393,9 @@ class LensOptions:
     )
 
 
-def _read_lens(files: Files, rig: Rig, options: LensOptions) -> tuple[Any, ...]:
+def _read_lens(
+    files: Files, rig: Rig, options: LensOptions
+) -> tuple[Camera, lens.PlaneView | None, tuple[float, float, float, float] | None]:
     import numpy as np
 
     from calib.stages.camera.lens import PlaneView

@@ -122,7 +122,9 @@ class Runs:
         return Verdict((Finding("remark", text),))
 
 
-def _read_run(files: Files, rig: Rig, options: RunOptions) -> tuple[Any, ...]:
+def _read_run(
+    files: Files, rig: Rig, options: RunOptions
+) -> tuple[SimulatedRig, Model, Reference, Sequence[str], Controller | None, RunOptions, Progress]:
     from calib.stages.control.trial import CONTROLLERS, controllers_for
 
     for name in options.controllers or ():
@@ -408,7 +410,9 @@ class ControllerEvidence:
     position: Tuned
 
 
-def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> tuple[Any, ...]:
+def _read_tune(
+    files: Files, rig: Rig, options: TuneOptions
+) -> tuple[SimulatedRig, Model, ControllerCriterion, Progress, Sequence[str]]:
     from calib.stages.control.section import ControllerCriterion
     from calib.stages.control.trial import controlled
 

@@ -39,7 +39,9 @@ class ReplayOptions(LogOptions):
     tune: bool = option(False, "Learn the noise from these logs; written to the rig's file.")
 
 
-def _read(files: Files, rig: Rig, options: ReplayOptions) -> tuple[Any, ...]:
+def _read(
+    files: Files, rig: Rig, options: ReplayOptions
+) -> tuple[Files, Rig, ReplayOptions, Sequence[Path | None]]:
     from calib.core.writing import check_folder, check_writable, make_folder
     from calib.io.states import STATES_FILE
 

@@ -29,10 +29,10 @@ class FirmwareOptions:
     )
 
 
-def _read(files: Files, rig: Rig, options: FirmwareOptions) -> tuple[Any, ...]:
+def _read(files: Files, rig: Rig, options: FirmwareOptions) -> tuple[Rig, str, Sequence[Frame] | None, str]:
     source = shown(files.rig_path)
     if options.check is None:
-        return rig, source
+        return rig, source, None, ""
     from calib.stages.firmware.check import read_frames
 
     log = Path(options.check)
@@ -40,7 +40,7 @@ def _read(files: Files, rig: Rig, options: FirmwareOptions) -> tuple[Any, ...]:
     return rig, source, read_frames(log), shown(log)
 
 
-def _solve(rig: Rig, source: str, frames: Sequence[Frame] | None = None, log: str = "") -> Header | Check:
+def _solve(rig: Rig, source: str, frames: Sequence[Frame] | None, log: str) -> Header | Check:
     """From a rig with its file's name, and the frames of a board with the name of their log."""
     from calib.stages.firmware.check import check_frames
     from calib.stages.firmware.header import header_of
