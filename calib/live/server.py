@@ -52,6 +52,9 @@ MOST_BYTES = 64_000_000
 _MOST_PREVIEW_BYTES = 4_000_000
 _MOST_WORDS = 2_000
 _MOST_TABS = 6
+_MOST_WAITING = 100
+"""Messages that wait for a page: those of some seconds."""
+_LAST_WORDS_S = 1.0
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _PREVIEW_PX = 800
 _SWITCH_S = 0.0005
@@ -68,7 +71,10 @@ class _Tab:
     """One page that is open."""
 
     socket: WebSocket
-    sending: asyncio.Lock = field(default_factory=asyncio.Lock)
+    waiting: asyncio.Queue[str | bytes] = field(default_factory=lambda: asyncio.Queue(_MOST_WAITING))
+    behind: asyncio.Event = field(default_factory=asyncio.Event)
+    """It does not take what it is told, as one that sleeps: no other page waits for it."""
+    busy: bool = False
     size_px: tuple[int, int] | None = None
     shot_until: float = 0.0
     by_hand: bool = False
@@ -77,18 +83,30 @@ class _Tab:
     """What its camera's times lack to those of this computer."""
 
     async def tell(self, message: dict[str, Any] | bytes) -> None:
-        """Send words or a frame; a page that has gone is no reason to fail."""
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            async with self.sending:
-                if isinstance(message, bytes):
-                    await self.socket.send_bytes(message)
-                else:
-                    await self.socket.send_text(json.dumps(message, allow_nan=False))
+        """Send words or a frame, when it is their turn."""
+        text = message if isinstance(message, bytes) else json.dumps(message, allow_nan=False)
+        try:
+            self.waiting.put_nowait(text)
+        except asyncio.QueueFull:
+            self.behind.set()
 
     async def show(self, jpeg: bytes) -> None:
         """Send a frame, unless the page is still busy with another."""
-        if not self.sending.locked():
+        if not self.busy and self.waiting.empty():
             await self.tell(jpeg)
+
+    async def send(self) -> None:
+        """Send what waits, until the page has gone, which is no reason to fail."""
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                message = await self.waiting.get()
+                self.busy = True
+                if isinstance(message, bytes):
+                    await self.socket.send_bytes(message)
+                else:
+                    await self.socket.send_text(message)
+                self.busy = False
+                self.waiting.task_done()
 
 
 class Live:
@@ -288,25 +306,28 @@ class Live:
         await websocket.accept()
         tab = _Tab(websocket)
         self._tabs.append(tab)
+        work = [asyncio.ensure_future(one) for one in (self._listen(tab), tab.send(), tab.behind.wait())]
         try:
-            await tab.tell(await asyncio.to_thread(self.state))
-            if self.source is not None and self.source.fault:
-                await tab.tell({"type": "camera", "fault": self.source.fault})
-            while True:
-                message = await websocket.receive()
-                if message["type"] == "websocket.disconnect":
-                    return
-                if message.get("bytes") is not None:
-                    await self._frame(tab, message["bytes"])
-                else:
-                    await self._asked(tab, message.get("text") or "")
-        except WebSocketDisconnect:
-            pass
+            # The first that ends is the end; a page that was behind connects again, and gets all.
+            for one in (await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED))[0]:
+                one.result()
         finally:
+            for each in work:
+                each.cancel()
             self._tabs.remove(tab)
             if self._camera is tab:
                 self._camera = None
                 await self.tell_all({"type": "free"})
+
+    async def _listen(self, tab: _Tab) -> None:
+        await tab.tell(await asyncio.to_thread(self.state))
+        if self.source is not None and self.source.fault:
+            await tab.tell({"type": "camera", "fault": self.source.fault})
+        while (message := await tab.socket.receive())["type"] != "websocket.disconnect":
+            if message.get("bytes") is not None:
+                await self._frame(tab, message["bytes"])
+            else:
+                await self._asked(tab, message.get("text") or "")
 
     async def _asked(self, tab: _Tab, text: str) -> None:
         asked: Any = None
@@ -513,6 +534,8 @@ class Live:
 
     async def _done(self) -> None:
         await self.tell_all({"type": "done", "folder": str(self.album.folder)})
+        told = [asyncio.ensure_future(tab.waiting.join()) for tab in self._tabs]
+        await asyncio.wait(told, timeout=_LAST_WORDS_S)
         self.finished.set()
 
     # ------------------------------------------------------------------

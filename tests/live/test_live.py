@@ -540,6 +540,24 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
     assert MOST_PIXELS * 3 > MOST_BYTES
 
 
+def test_a_page_that_sleeps_holds_up_no_other(tmp_path: Path) -> None:
+    """It takes nothing that it is sent, until it is let go; it may connect again."""
+    frame = jpeg(np.random.default_rng(0).integers(0, 255, (480, 640, 3)).astype(np.uint8))
+    with served(tmp_path / "rig") as live, tab(live) as line, tab(live):
+        line.send('{"do": "camera", "size": [640, 480]}')
+        wait(lambda: len(live._tabs) == 2)
+        for _ in range(1000):
+            line.send(frame)
+            heard(line, "seen")
+            if len(live._tabs) == 1:
+                break
+        assert len(live._tabs) == 1
+        with tab(live) as again:
+            heard(again, "state")
+            line.send('{"do": "done"}')
+            assert heard(again, "done")
+
+
 def half_a_rig(folder: Path, project_root: Path) -> bytes:
     """A folder with pictures for the camera; the picture of its board in the plane."""
     (folder / "images").mkdir(parents=True)
@@ -778,6 +796,8 @@ def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
             )
             assert browser.run("document.documentElement.scrollWidth") == 390
             assert not browser.run("document.getElementById('auto').checked")
+            # As after a click on it.
+            browser.run("document.getElementById('sound').focus()")
             browser.key("d", 68, "d")
             assert live.finished.wait(PATIENCE_S)
             wait(lambda: "Done. Saved" in browser.run("document.getElementById('says').textContent"))
