@@ -258,7 +258,7 @@ def test_a_log_with_its_true_parameters(tmp_path: Path) -> None:
     keys = ("stiffness_scale", "damping_scale_pumps_connected", "bending_N_per_rad2", "lambda1_per_s")
     keys += "lambda2_N_per_m", "damping_scale_free_swing", "rest_length_m"
     actuator = {key: truth[key] for key in keys}
-    pump = {key: truth[key] for key in ("lag_s", "falling_N_per_s")}
+    pump = {key: truth[key] for key in ("lag_s", "lag_ratio", "falling_N_per_s")}
     pump["strength"] = [truth["strength1"], truth["strength2"]]
     path = tmp_path / "rig.yaml"
     stated = Known(actuator=KnownActuator(**actuator, lambda3=-1.0), pump=KnownPump(**pump))

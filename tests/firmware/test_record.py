@@ -159,7 +159,7 @@ def test_a_command_beyond_the_envelope_drives_nothing(tmp_path: Path) -> None:
 
 def test_without_a_computer_that_it_needs_nothing_begins(tmp_path: Path) -> None:
     simulated = SimulatedBoard(sketch(tmp_path, "POSITION", "-DCALIB_EXAMPLE_HEARTBEAT=1"), 25.0)
-    for _ in range(300):
+    for _ in range(75):
         simulated.run(0.04)
         assert simulated.duty == (0, 0)
     on, decoder, faults = [], Decoder(), set()
@@ -176,6 +176,7 @@ def test_without_a_computer_that_it_needs_nothing_begins(tmp_path: Path) -> None
     assert faults == {0, 8}
 
 
+@pytest.mark.slow
 def test_a_computer_that_clears_every_fault_at_once_does_not_keep_a_pump_at_full_power(
     tmp_path: Path,
 ) -> None:

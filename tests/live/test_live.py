@@ -540,6 +540,7 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
     assert MOST_PIXELS * 3 > MOST_BYTES
 
 
+@pytest.mark.slow
 def test_a_page_that_sleeps_holds_up_no_other(tmp_path: Path) -> None:
     """It takes nothing that it is sent, until it is let go; it may connect again."""
     frame = jpeg(np.random.default_rng(0).integers(0, 255, (480, 640, 3)).astype(np.uint8))
