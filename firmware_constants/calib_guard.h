@@ -16,7 +16,7 @@
  *   CALIB_FAULT_SELFTEST     the self-test failed                                at a reset
  *   CALIB_FAULT_IMU_LOST     12 samples in a row lost, weightless or beyond 3 g,  by itself
  *                            or more than a fifth of them for long
- *   CALIB_FAULT_IMU_FROZEN   12 times the very same sample, or 36 times the same  by itself
+ *   CALIB_FAULT_IMU_FROZEN   12 times the very same sample, or 72 times the same  by itself
  *                            rate or the same force
  *   CALIB_FAULT_CAMERA_LOST  15 pictures without a marker, or more than a        by itself
  *                            fifth of them for long, where a mode needs them
@@ -84,7 +84,8 @@ extern "C" {
 #define CALIB_GUARD_IMU_BAD (12 * CALIB_GUARD_BAD)
 #define CALIB_GUARD_CAMERA_BAD (15 * CALIB_GUARD_BAD)
 #define CALIB_GUARD_SAME 12
-#define CALIB_GUARD_SAME_ONE 36 /* of one sensor alone: noise changes it far sooner */
+/* Of one sensor alone. At rest a gyroscope whose noise is 0.4 of its step repeats itself four times of five. */
+#define CALIB_GUARD_SAME_ONE 72
 #define CALIB_GUARD_SHAKEN_MPS2 30.0f /* specific force that a rig has for moments only */
 #define CALIB_GUARD_FROZEN_RAD 0.25f /* angle that moves the marker by pixels */
 #define CALIB_GUARD_FROZEN 6
@@ -589,8 +590,8 @@ static inline uint8_t calib_guard_selftest(void) {
     /* Fault, kind, tick, ticks until it is over. The last is not of the fused estimator, which always needs the camera. */
     static const uint8_t tries[25][4] = {
         {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
-        {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_IMU_FROZEN, 1, 35, 61},
-        {CALIB_FAULT_IMU_FROZEN, 2, 37, 63},
+        {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_IMU_FROZEN, 1, 71, 61},
+        {CALIB_FAULT_IMU_FROZEN, 2, 73, 63},
         {CALIB_FAULT_CAMERA_LOST, 0, 15, 119},
         {CALIB_FAULT_CAMERA_LOST, 1, 39, 119},  {CALIB_FAULT_CAMERA_FROZEN, 0, 8, 60},
         {CALIB_FAULT_CAMERA_FROZEN, 1, 7, 60},

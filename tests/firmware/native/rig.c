@@ -522,7 +522,7 @@ static int at_many_moments(const char *clock, double first_ms, double step_ms, i
                 until_ms = at_ms + 1500.0;
                 off_since = -1;
                 /* A fault may come back once while the angle recovers; then the guard waits twice as long. */
-                if (go_on(k ? at_ms + 700.0 : until_ms + 5000.0)) {
+                if (go_on(k ? at_ms + 1400.0 : until_ms + 5000.0)) {
                     _exit(5);
                 }
                 fprintf(out, "%s %.1f %.2f %d\n", fault, at_ms, off_after(), was_on);
