@@ -230,7 +230,7 @@ def test_sigma_holds_what_is_another_in_one_log(
 def test_accelerations_that_come_late_are_told_and_in_sigma(
     late_s: float, scenarios: tuple[int, ...], word: str
 ) -> None:
-    """As of sensors with low-passes of their own, which put the IMU 9 deviations off, and of slow motion."""
+    """As of sensors with low-passes of their own, which put time offsets 8 deviations off; slow motion."""
     trial = known(SimulatedRig())
     logs = [align_log(twin_log(trial.rig, *MOTIONS[k], k)) for k in scenarios]
     for k, log in enumerate(logs):
