@@ -234,7 +234,7 @@ def test_a_board_that_moves_is_followed_in_a_fraction_of_the_time_that_finding_i
         live._before = live._before if k % 4 else None
     found, followed = np.median(spent[1::4]), np.median(spent[2::4] + spent[3::4])
     print(f"CPU time of a frame of 640x480: {1e3 * found:.0f} ms to find, {1e3 * followed:.0f} ms to follow")
-    assert followed < 0.4 * found and followed < 0.05
+    assert followed < 0.4 * found
     inner = np.sort(seen.corners_px[..., 0].mean(axis=0))
     for out in (inner[1] - 20.0, inner[0] + 3.0):
         cut = np.ascontiguousarray(np.pad(gray[:, int(out) :], ((0, 0), (0, int(out))), "edge"))
