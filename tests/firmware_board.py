@@ -42,7 +42,8 @@ __all__ = ["Board", "serve"]
 
 _NUMBERS = count()
 _STEP_S = 1.0 / 1200.0
-_FRAME_S = 1.0 / 60.0
+_FRAME_S = 1.0 / 60.7
+"""By the camera's own oscillator."""
 _FELT_HZ = 400.0
 _ACCEL_HZ = {code: (7.8125 * 2**code, 15.625 * 2**code) for code in range(8)}
 _GYRO_HZ = {0: (523, 2000), 1: (230, 2000), 2: (116, 1000), 3: (47, 400),
@@ -110,7 +111,7 @@ class Board:
         self._chip = _Sensor(_ACCEL_HZ, clock), _Sensor(_GYRO_HZ, clock)
         frames = np.arange(int(seconds / _FRAME_S)) * _FRAME_S
         self._tracker = draw_tracker_noise(self.rig.tracker, frames, seed)
-        self._shown = np.zeros(9, dtype=np.int32)
+        self._shown = np.zeros(10, dtype=np.int32)
         self._taken = np.zeros(1 << 16, dtype=np.uint8)
         self._out = np.empty((1, 10))
         self._steps = 0
@@ -156,7 +157,8 @@ class Board:
             0
         ]
         self._shown[6] = not np.isnan(u)
-        self._shown[7:] = (0, 0) if np.isnan(u) else (u, v)
+        self._shown[7:9] = (0, 0) if np.isnan(u) else (u, v)
+        self._shown[9] = k + 1
         self.states.append(self.row.copy())
 
     def _step(self) -> None:

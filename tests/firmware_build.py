@@ -198,7 +198,7 @@ def link(folder: Path, source: Path, *flags: str) -> Built:
 
 def pack(given: Inputs) -> bytes:
     """The record that program.c takes."""
-    return struct.pack("<7f3B", *given.numbers, given.marker_seen, given.imu_read, given.mode)
+    return struct.pack("<8f3B", *given.numbers, given.marker_seen, given.imu_read, given.mode)
 
 
 @dataclass(frozen=True)
@@ -240,14 +240,14 @@ class Simulated:
 
     Attributes
     ----------
-    record : (31,) bytes of the next tick's inputs, as `pack` makes them. result : (72,) bytes.
+    record : (35,) bytes of the next tick's inputs, as `pack` makes them. result : (72,) bytes.
     """
 
     def __init__(self, command: Sequence[str]) -> None:
         library = ctypes.CDLL(f"{command[0]}.so")
         addresses = [int(word, 0) & 0xFFFF for word in command[2:5]]
         assert library.runner_open(command[1].encode(), *addresses) == 0
-        self.record, self.result = np.zeros(31, dtype=np.uint8), np.zeros(72, dtype=np.uint8)
+        self.record, self.result = np.zeros(35, dtype=np.uint8), np.zeros(72, dtype=np.uint8)
         self._tick = library.runner_tick
         self._places = (ctypes.c_void_p(self.record.ctypes.data), ctypes.c_void_p(self.result.ctypes.data))
 
@@ -314,7 +314,7 @@ def compare(
 def strew(ticks: list[Inputs], rng: np.random.Generator, losses: int) -> None:
     """Put hostile values into some of the ticks, and let a sensor fall silent `losses` times."""
     for k in rng.choice(len(ticks), 3000, replace=False).tolist():
-        field = rng.choice(["u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps"])
+        field = rng.choice(["u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps", "late_ticks"])
         ticks[k] = binary32(replace(ticks[k], **{str(field): float(rng.choice(HOSTILE))}))
     for k in rng.choice(len(ticks), 300, replace=False).tolist():
         ticks[k] = binary32(
@@ -328,10 +328,10 @@ def strew(ticks: list[Inputs], rng: np.random.Generator, losses: int) -> None:
 
 def hostile(rng: np.random.Generator, count: int) -> list[Inputs]:
     """Ticks in which every value is hostile at once."""
-    draw = rng.choice(HOSTILE, (count, 7)).tolist()
+    draw = rng.choice(HOSTILE, (count, 8)).tolist()
     modes = rng.integers(0, 5, len(draw)).tolist()
     seen = rng.integers(0, 2, (len(draw), 2)).tolist()
     return [
-        binary32(Inputs(*row[:5], (row[5], row[6]), bool(a), bool(b), mode))
+        binary32(Inputs(*row[:5], (row[5], row[6]), bool(a), bool(b), mode, row[7]))
         for row, mode, (a, b) in zip(draw, modes, seen, strict=True)
     ]

@@ -9,6 +9,7 @@ from calib.io.serial import (
     _IMU,
     _PAYLOADS,
     _PICTURE,
+    _PUNCTUAL,
     _SYNC,
     _TICK,
     _UNGUARDED,
@@ -22,8 +23,8 @@ from calib.io.serial import (
 )
 
 
-def encoded(frame: Message) -> bytes:
-    """The frame as a board sends it; a tick without a time as sketches of before did."""
+def encoded(frame: Message, punctual: bool = False) -> bytes:
+    """The frame as a board sends it; a tick without a time or lateness as sketches of before did."""
     if isinstance(frame, Hello):
         return _framed(_HELLO, _PAYLOADS[_HELLO].pack(*vars(frame).values()))
     if isinstance(frame, ImuSample):
@@ -36,10 +37,12 @@ def encoded(frame: Message) -> bytes:
         rest = (*frame.marker_px, *frame.guard.numbers, frame.overruns)
         return _framed(_PICTURE, _PAYLOADS[_PICTURE].pack(*times, *rest))
     given, out, guard = frame.given, frame.out, frame.guard
+    punctual = punctual or guard is None or frame.t_us is None
     head = (frame.identity, frame.rate_mhz, frame.sequence, given.sensors, given.mode)
-    numbers = (*head, *given.numbers, *out.numbers, out.flags)
+    numbers = (*head, *given.numbers[: 7 if punctual else 8], *out.numbers, out.flags)
     if guard is not None and frame.t_us is not None:
-        return _framed(_TICK, _PAYLOADS[_TICK].pack(frame.t_us, *numbers, *guard.numbers))
+        layout = _PUNCTUAL if punctual else _PAYLOADS[_TICK]
+        return _framed(_TICK, layout.pack(frame.t_us, *numbers, *guard.numbers))
     payload = _UNGUARDED.pack(*numbers) if guard is None else _UNTIMED.pack(*numbers, *guard.numbers)
     body = bytes([len(payload)]) + payload
     return _SYNC + body + struct.pack("<H", checksum(body))

@@ -151,14 +151,13 @@ class Done:
 
     Attributes
     ----------
-    seconds : of the log. imu, pictures, unseen : samples, pictures, those without a marker. lost : messages
+    seconds : of the log. imu, markers : samples, and pictures that showed the marker. lost : messages
         that never came. damaged : frames. overruns : samples that the board left out.
     """
 
     seconds: float
     imu: int
-    pictures: int
-    unseen: int
+    markers: int
     lost: int
     damaged: int
     overruns: int
@@ -167,9 +166,8 @@ class Done:
     def words(self) -> str:
         """In one line."""
         per_s = 1.0 / max(self.seconds, 1e-3)
-        rates = f"IMU {self.imu * per_s:.1f} Hz, pictures {self.pictures * per_s:.1f} Hz"
-        marker = f" ({self.unseen} without a marker)" if self.unseen else ""
-        return f"{self.seconds:.1f} s, {rates}{marker}, {self.lost} lost, {self.overruns} overruns"
+        rates = f"IMU {self.imu * per_s:.1f} Hz, marker {self.markers * per_s:.1f} Hz"
+        return f"{self.seconds:.1f} s, {rates}, {self.lost} lost, {self.overruns} overruns"
 
 
 class Board:
@@ -250,45 +248,47 @@ def perform(
 def _recorded(
     board: Board, plan: Experiment, level: float, write: Callable[[str], None], before: list[Message]
 ) -> Done:
-    rows, imu, pictures, unseen, overruns = Rows(), 0, 0, 0, 0
+    rows, imu, markers, overruns = Rows(), 0, 0, 0
     first_overruns: int | None = None
     top = level * min(board.hello.open_high, _MOST_PWM)
     damaged, heard_s = board.decoder.damaged, board.port.now_s()
     queue, came = deque(before), board.messages()
-    while rows.time_s < plan.seconds:
-        message = queue.popleft() if queue else next(came)
-        now = board.port.now_s()
-        if plan.command is not None:
-            first, second = plan.command(rows.time_s)
-            board.pumps((round(top * first), round(top * second)))
-        if message is None or isinstance(message, Hello | Frame):
-            if isinstance(message, Frame) or (isinstance(message, Hello) and rows.begins_anew(message)):
-                kept = message.kept if isinstance(message, Hello) else 0
-                why = f" ({FAULTS[kept]})" if kept in FAULTS else ""
+    try:
+        while rows.time_s < plan.seconds:
+            message = queue.popleft() if queue else next(came)
+            now = board.port.now_s()
+            if plan.command is not None:
+                first, second = plan.command(rows.time_s)
+                board.pumps((round(top * first), round(top * second)))
+            if message is None or isinstance(message, Hello | Frame):
+                if isinstance(message, Frame) or (isinstance(message, Hello) and rows.begins_anew(message)):
+                    kept = message.kept if isinstance(message, Hello) else 0
+                    why = f" ({FAULTS[kept]})" if kept in FAULTS else ""
+                    raise BadInputError(
+                        f"{board.name}: the board restarted after {rows.time_s:.1f} s{why}; record this again"
+                    )
+                if now - heard_s > _RESTARTS_S:
+                    raise BadInputError(
+                        f"{board.name}: the board fell silent after {rows.time_s:.1f} s; record this again"
+                    )
+                continue
+            heard_s = now
+            write(rows.take(message))
+            if isinstance(message, ImuSample):
+                imu += 1
+                continue
+            markers += message.seen
+            first_overruns = message.overruns if first_overruns is None else first_overruns
+            overruns = message.overruns - first_overruns
+            if plan.command is not None and message.guard.state == GUARD_FAULT:
                 raise BadInputError(
-                    f"{board.name}: the board restarted after {rows.time_s:.1f} s{why}; record this again"
+                    f"{board.name}: after {rows.time_s:.1f} s the guard stopped the pumps: "
+                    f"{FAULTS.get(message.guard.fault, message.guard.fault)}; see the envelope in rig.yaml, "
+                    "or record with a lower --level"
                 )
-            if now - heard_s > _RESTARTS_S:
-                raise BadInputError(
-                    f"{board.name}: the board fell silent after {rows.time_s:.1f} s; record this again"
-                )
-            continue
-        heard_s = now
-        write(rows.take(message))
-        if isinstance(message, ImuSample):
-            imu += 1
-            continue
-        pictures, unseen = pictures + 1, unseen + (not message.seen)
-        first_overruns = message.overruns if first_overruns is None else first_overruns
-        overruns = message.overruns - first_overruns
-        if plan.command is not None and message.guard.state == GUARD_FAULT:
-            raise BadInputError(
-                f"{board.name}: after {rows.time_s:.1f} s the guard stopped the pumps: "
-                f"{FAULTS.get(message.guard.fault, message.guard.fault)}; see the envelope in rig.yaml, "
-                "or record with a lower --level"
-            )
-    lost = rows.lost
-    return Done(rows.time_s, imu, pictures, unseen, lost, board.decoder.damaged - damaged, overruns)
+    finally:
+        write(rows.rest())
+    return Done(rows.time_s, imu, markers, rows.lost, board.decoder.damaged - damaged, overruns)
 
 
 def _lets_run(message: Message) -> bool:

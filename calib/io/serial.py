@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import math
 import signal
 import struct
 from binascii import crc_hqx
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,10 +34,13 @@ _UNGUARDED, _UNTIMED = struct.Struct("<IIHBB7f9fH"), struct.Struct("<IIHBB7f9fH5
 """Ticks of sketches before the guard, and before frames had a version: their length stands in its place."""
 _PAYLOADS = {
     _HELLO: struct.Struct("<HII6B"),
-    _TICK: struct.Struct("<IIIHBB7f9fH5B"),
+    _TICK: struct.Struct("<IIIHBB8f9fH5B"),
     _IMU: struct.Struct("<HI6f"),
     _PICTURE: struct.Struct("<HIHB2f6B"),
 }
+
+_PUNCTUAL = struct.Struct("<IIIHBB7f9fH5B")
+"""Ticks of sketches that did not tell how late their pictures were."""
 
 BOARD_COLUMNS = (
     "sequence", "rate_mhz", "calib_id", "marker_seen", "imu_read", "mode",
@@ -47,6 +52,9 @@ BOARD_COLUMNS = (
 
 GUARD_COLUMNS = ("duty_1", "duty_2", "guard_state", "guard_fault", "kept_fault")
 """Those of the guard, which older logs lack."""
+
+_LATE = "late_ticks"
+"""How late a tick's picture was, which older logs lack."""
 
 _LOG_COLUMNS = ("t_s", "u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps", "pwm1", "pwm2")
 
@@ -69,6 +77,7 @@ class Inputs:
     u_px, v_px : marker as the camera reports it.
     ax_mps2, ay_mps2, gz_radps : IMU.
     reference : angle [rad] and anything, or both lengths [m].
+    late_ticks : since the picture had its time in the logs, 0 to 1 tick.
     marker_seen, imu_read : whether something came in.
     mode : of the controller.
     """
@@ -82,17 +91,19 @@ class Inputs:
     marker_seen: bool = True
     imu_read: bool = True
     mode: int = MODE_OFF
+    late_ticks: float = 0.0
 
     @staticmethod
     def of(numbers: Sequence[float], sensors: int, mode: int) -> Inputs:
         """Inputs from `numbers`, `sensors` and mode."""
-        u, v, ax, ay, gz, r1, r2 = map(float, numbers)
-        return Inputs(u, v, ax, ay, gz, (r1, r2), bool(sensors & 1), bool(sensors & 2), mode)
+        u, v, ax, ay, gz, r1, r2, late = map(float, numbers)
+        return Inputs(u, v, ax, ay, gz, (r1, r2), bool(sensors & 1), bool(sensors & 2), mode, late)
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """Marker, IMU and reference: seven numbers."""
-        return (self.u_px, self.v_px, self.ax_mps2, self.ay_mps2, self.gz_radps, *self.reference)
+        """Marker, IMU, reference and lateness: eight numbers."""
+        sensors = (self.u_px, self.v_px, self.ax_mps2, self.ay_mps2, self.gz_radps)
+        return (*sensors, *self.reference, self.late_ticks)
 
     @property
     def sensors(self) -> int:
@@ -266,7 +277,7 @@ def setting(samples: bool, pumps: tuple[int, int] | None = None) -> bytes:
 
 
 def _decoded(kind: int, payload: bytes) -> Message:
-    numbers = _PAYLOADS[kind].unpack(payload)
+    numbers = _layout(kind, len(payload)).unpack(payload)
     if kind == _TICK:
         return _tick(numbers[1:], numbers[0])
     if kind == _HELLO:
@@ -278,10 +289,17 @@ def _decoded(kind: int, payload: bytes) -> Message:
     return Picture(sequence, t_us, after_us, bool(seen), (u, v), Guard.of(guard), overruns)
 
 
+def _layout(kind: int, length: int) -> struct.Struct:
+    return _PUNCTUAL if (kind, length) == (_TICK, _PUNCTUAL.size) else _PAYLOADS[kind]
+
+
 def _tick(numbers: Sequence[Any], t_us: int | None) -> Frame:
     identity, rate, sequence, sensors, mode, *rest = numbers
-    given, out = Inputs.of(rest[:7], sensors, mode), Outputs.of(rest[7:16], rest[16])
-    guard = Guard.of(rest[17:]) if len(rest) > 17 else None
+    if len(rest) != 23:
+        # A sketch that does not tell how late its pictures are.
+        rest.insert(7, 0.0)
+    given, out = Inputs.of(rest[:8], sensors, mode), Outputs.of(rest[8:17], rest[17])
+    guard = Guard.of(rest[18:]) if len(rest) > 18 else None
     return Frame(identity, rate, sequence, given, out, guard, t_us)
 
 
@@ -314,7 +332,7 @@ class Decoder:
             old = {one.size: one for one in (_UNGUARDED, _UNTIMED)}.get(waiting[2])
             begin = 3 if old else 5
             if old is None and not (waiting[2] == VERSION and waiting[3] in _PAYLOADS
-                                    and waiting[4] == _PAYLOADS[waiting[3]].size):  # fmt: skip
+                                    and waiting[4] == _layout(waiting[3], waiting[4]).size):  # fmt: skip
                 self._skip(1)
                 continue
             end = begin + waiting[begin - 1]
@@ -335,7 +353,7 @@ class Decoder:
 
 def csv_header() -> str:
     """First line of a log of frames."""
-    return ",".join((*_LOG_COLUMNS, *BOARD_COLUMNS, *GUARD_COLUMNS)) + "\n"
+    return ",".join((*_LOG_COLUMNS, *BOARD_COLUMNS, *GUARD_COLUMNS, _LATE)) + "\n"
 
 
 def text(value: float) -> str:
@@ -343,17 +361,23 @@ def text(value: float) -> str:
     return f"{value:.9g}"
 
 
-def csv_row(frame: Frame, time_s: float) -> str:
-    """A line of a log of ticks, which begins with its time."""
-    g = frame.given
+def csv_rows(frame: Frame, time_s: float) -> list[tuple[float, str]]:
+    """Lines of a log of ticks with their times: a picture that is older than its tick, and the tick."""
+    g, rows = frame.given, []
     marker = [text(g.u_px), text(g.v_px)] if g.marker_seen else ["", ""]
+    if g.marker_seen and 0.0 < g.late_ticks <= 1.0 and frame.rate_mhz:
+        shown_s = time_s - 1e3 * g.late_ticks / frame.rate_mhz
+        blank = [""] * (len(_LOG_COLUMNS) - 3 + len(BOARD_COLUMNS) + len(GUARD_COLUMNS) + 1)
+        rows.append((shown_s, ",".join([text(shown_s), *marker, *blank]) + "\n"))
+        marker = ["", ""]
     imu = [text(v) for v in (g.ax_mps2, g.ay_mps2, g.gz_radps)]
     whole = [frame.sequence, frame.rate_mhz, frame.identity, int(g.marker_seen), int(g.imu_read), g.mode]
     board = [g.u_px, g.v_px, *g.reference, *frame.out.numbers[:7]]
     sensors = [*marker, *(imu if g.imu_read else ["", "", ""])]
     cells = [text(time_s), *sensors, *map(text, frame.out.pwm), *map(str, whole), *map(text, board)]
     guard = [""] * len(GUARD_COLUMNS) if frame.guard is None else map(str, frame.guard.numbers)
-    return ",".join([*cells, str(frame.out.flags), *guard]) + "\n"
+    rows.append((time_s, ",".join([*cells, str(frame.out.flags), *guard, text(g.late_ticks)]) + "\n"))
+    return rows
 
 
 def frame_from_row(row: dict[str, str]) -> Frame:
@@ -361,7 +385,8 @@ def frame_from_row(row: dict[str, str]) -> Frame:
     number = {name: float(row[name]) for name in (*BOARD_COLUMNS, "pwm1", "pwm2")}
     imu = [float(row[name]) if row[name] else 0.0 for name in ("ax_mps2", "ay_mps2", "gz_radps")]
     sensors = int(number["marker_seen"]) + 2 * int(number["imu_read"])
-    into = (number["board_u_px"], number["board_v_px"], *imu, number["reference_1"], number["reference_2"])
+    reference = number["reference_1"], number["reference_2"]
+    into = (number["board_u_px"], number["board_v_px"], *imu, *reference, float(row.get(_LATE) or 0.0))
     out = [number[name] for name in (*BOARD_COLUMNS[10:17], "pwm1", "pwm2")]
     guard = [row.get(name) for name in GUARD_COLUMNS]
     return Frame(
@@ -406,6 +431,9 @@ class Recording:
     damaged: int
 
 
+_HELD_S = 0.2
+
+
 class Rows:
     """Lines of a log from what one start of a board sends: times from zero, losses counted.
 
@@ -413,6 +441,9 @@ class Rows:
     ----------
     samples : whether it is a log of samples, None before anything came. count, lost : ticks or samples that
         came, and that never came. time_s : of the last one.
+
+    A picture comes after samples that are younger. So that a log's times never go back, lines of the last
+    `_HELD_S` wait for those before them.
     """
 
     def __init__(self) -> None:
@@ -420,6 +451,7 @@ class Rows:
         self.count = self.lost = 0
         self.time_s = 0.0
         self._last: tuple[int, int | None] | None = None
+        self._held: list[tuple[float, str]] = []
 
     def begins_anew(self, message: Message) -> bool:
         """Whether the message is of another start of the board, or another kind of log, than those before."""
@@ -428,7 +460,7 @@ class Rows:
         sequence, t_us = self._last
         if isinstance(message, Hello):
             return message.sequence == 0 and sequence != 0xFFFF
-        back = t_us is not None and message.t_us is not None and (message.t_us - t_us) & 0xFFFFFFFF >= 1 << 31
+        back = t_us is not None and message.t_us is not None and _since_s(message.t_us, t_us) < -_HELD_S
         again = isinstance(message, Frame) and message.sequence == 0 and sequence != 0xFFFF
         return back or again or isinstance(message, Frame) == self.samples
 
@@ -436,36 +468,56 @@ class Rows:
         """Its lines, with the log's first line before them; empty for one that is none of a log."""
         if isinstance(message, Hello):
             return ""
-        begins = self._last is None
+        lines = ""
         if self._last is None:
             self.samples = not isinstance(message, Frame)
+            lines = csv_header() if isinstance(message, Frame) else ",".join(SAMPLE_COLUMNS) + "\n"
         else:
             sequence, t_us = self._last
             step = (message.sequence - sequence) & 0xFFFF
             self.lost += max(step - 1, 0)
             if message.t_us is not None and t_us is not None:
-                self.time_s += 1e-6 * ((message.t_us - t_us) & 0xFFFFFFFF)
+                self.time_s += _since_s(message.t_us, t_us)
             elif isinstance(message, Frame) and message.rate_mhz:
                 self.time_s += 1e3 * step / message.rate_mhz
         self._last = (message.sequence, message.t_us)
         self.count += 1
         if isinstance(message, Frame):
-            return (csv_header() if begins else "") + csv_row(message, self.time_s)
-        return (",".join(SAMPLE_COLUMNS) + "\n" if begins else "") + _sample_rows(message, self.time_s)
+            rows = csv_rows(message, self.time_s)
+        else:
+            rows = _sample_rows(message, self.time_s)
+        # A picture from before the first message is of no use.
+        self._held += [row for row in rows if row[0] >= 0.0]
+        return lines + self._before(self.time_s - _HELD_S)
+
+    def rest(self) -> str:
+        """The lines that still wait, at the end."""
+        return self._before(math.inf)
+
+    def _before(self, time_s: float) -> str:
+        self._held.sort(key=lambda row: row[0])
+        count = bisect_left(self._held, time_s, key=lambda row: row[0])
+        ready, self._held = self._held[:count], self._held[count:]
+        return "".join(line for _, line in ready)
 
 
-def _sample_rows(message: ImuSample | Picture, time_s: float) -> str:
-    """One line of a sample, two of a picture: what it showed, and what the pumps got then."""
+def _since_s(now_us: int, before_us: int) -> float:
+    """Seconds between two readings of the board's clock, which begins anew after 2**32."""
+    return 1e-6 * ((now_us - before_us + (1 << 31) & 0xFFFFFFFF) - (1 << 31))
+
+
+def _sample_rows(message: ImuSample | Picture, time_s: float) -> list[tuple[float, str]]:
+    """One line of a sample, two of a picture, with times: what it showed, and what the pumps got then."""
     if isinstance(message, ImuSample):
         axes = map(text, (*message.force, *message.rate))
-        return f"{time_s:.6f},,,{','.join(axes)},,,{message.sequence},,,\n"
+        return [(time_s, f"{time_s:.6f},,,{','.join(axes)},,,{message.sequence},,,\n")]
     guard, after_s = message.guard, time_s + 1e-6 * message.after_us
     marker = ",".join(map(text, message.marker_px)) if message.seen else ","
     told = f"{guard.state},{guard.fault},{message.overruns}"
-    return (
-        f"{time_s:.6f},{marker},,,,,,,,,{message.sequence},,,\n"
-        f"{after_s:.6f},,,,,,,,,{guard.duty[0]},{guard.duty[1]},,{told}\n"
-    )
+    return [
+        (time_s, f"{time_s:.6f},{marker},,,,,,,,,{message.sequence},,,\n"),
+        (after_s, f"{after_s:.6f},,,,,,,,,{guard.duty[0]},{guard.duty[1]},,{told}\n"),
+    ]
 
 
 def record(
@@ -490,7 +542,7 @@ def record(
                     if held:
                         opening += rows.count
                     else:
-                        write(len(runs), lines)
+                        write(len(runs), lines + rows.rest())
                         runs.append(Run(rows.count, rows.lost))
                     rows, lines, held = Rows(), "", False
                 lines += rows.take(message)
@@ -505,10 +557,10 @@ def record(
     except BadInputError:
         # The board is gone; what it sent is not.
         if rows.count:
-            write(len(runs), lines)
+            write(len(runs), lines + rows.rest())
         raise
     if rows.count:
-        write(len(runs), lines)
+        write(len(runs), lines + rows.rest())
         runs.append(Run(rows.count, rows.lost))
     return Recording(tuple(runs), opening, decoder.skipped, decoder.damaged)
 

@@ -121,7 +121,7 @@ def test_what_does_not_fit_does_not_compile(tmp_path: Path, line: str, message: 
     done = _compiled(tmp_path, "gcc", "-std=c99", f'{line}\n#include "calib_constants.h"\n')
     assert done.returncode != 0
     assert message in done.stderr
-    fits = "#define CALIB_EXPECT_SCHEMA 7\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
+    fits = "#define CALIB_EXPECT_SCHEMA 8\n#define CALIB_EXPECT_TICK_RATE_MHZ 60000\n"
     fits += "#define CALIB_EXPECT_PUMP_HIGH 255\n"
     done = _compiled(tmp_path, "gcc", "-std=c99", f'{fits}#include "calib_pipeline.h"\n')
     assert done.returncode == 0, done.stderr

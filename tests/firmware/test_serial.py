@@ -17,12 +17,17 @@ from calib.io.logs import read_log
 from calib.io.serial import (
     Decoder,
     Frame,
+    Guard,
+    ImuSample,
     Inputs,
     Outputs,
+    Picture,
     Recording,
+    Rows,
     Run,
     csv_header,
-    csv_row,
+    csv_rows,
+    frame_from_row,
     record,
 )
 from calib.stages.firmware.check import check_frames, read_frames
@@ -49,6 +54,40 @@ def test_there_and_back(sequence: int, value: float) -> None:
     decoder = Decoder()
     assert list(decoder.feed(encoded(sent))) == [sent]
     assert decoder.skipped == 0
+
+
+def test_a_sketch_that_does_not_tell_how_late_its_pictures_are_is_read() -> None:
+    sent = replace(frame(3), guard=Guard((7, 9), 2, 0, 0), t_us=5000)
+    assert list(Decoder().feed(encoded(sent, punctual=True))) == [sent]
+    late = replace(sent, given=replace(sent.given, late_ticks=0.625))
+    assert list(Decoder().feed(encoded(late))) == [late]
+
+
+def test_a_late_picture_is_a_row_of_its_time() -> None:
+    late = replace(frame(5), given=replace(frame(5).given, late_ticks=0.5))
+    (shown_s, shown), (at_s, tick) = csv_rows(late, 0.1)
+    assert (at_s - shown_s) * 60.0 == pytest.approx(0.5)
+    names = csv_header().strip().split(",")
+    rows = [dict(zip(names, line.strip().split(","), strict=True)) for line in (shown, tick)]
+    assert rows[0]["u_px"] == "158" and rows[1]["u_px"] == rows[0]["sequence"] == ""
+    assert binary32(frame_from_row(rows[1]).given) == late.given
+
+
+def test_times_of_a_log_never_go_back() -> None:
+    """A picture comes with the tick, after samples that were taken since; the clock begins anew meanwhile."""
+    rows, wrap, text = Rows(), 2**32 - 30_000, ""
+    for k in range(40):
+        t_us = wrap + 10_000 * k
+        text += rows.take(ImuSample(2 * k, t_us & 0xFFFFFFFF, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))
+        old_us = (t_us - 7_000) & 0xFFFFFFFF
+        picture = Picture(2 * k + 1, old_us, 9_000, True, (float(k), 1.0), Guard(), 0)
+        assert not rows.begins_anew(picture)
+        text += rows.take(picture)
+    table = [line.split(",") for line in (text + rows.rest()).splitlines()[1:]]
+    times = np.array([float(row[0]) for row in table])
+    assert (np.diff(times) >= 0.0).all() and times[0] == 0.0 and times[-1] == pytest.approx(0.392)
+    assert [float(row[1]) for row in table if row[1]] == list(range(1, 40))
+    assert rows.begins_anew(ImuSample(0, 100, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))
 
 
 @settings(max_examples=200)
@@ -123,7 +162,8 @@ def test_ticks_are_written_as_they_come() -> None:
         return frames.pop(0)
 
     record(read, lambda ticks: bool(frames), lambda run, text: written.append(text))
-    assert seen[100] == 0 and seen[300] == 301
+    # Lines of the last fifth of a second wait for older ones.
+    assert seen[100] == 0 and seen[300] == 301 - 13
 
 
 def _frames_check(ticks: int = 120) -> list[Frame]:
@@ -135,8 +175,13 @@ def _frames_check(ticks: int = 120) -> list[Frame]:
     return made
 
 
+def _text(frames: list[Frame]) -> str:
+    lines = [line for k, frame in enumerate(frames) for _, line in csv_rows(frame, k / 60)]
+    return "".join([csv_header(), *lines])
+
+
 def _log(path: Path, frames: list[Frame]) -> Path:
-    path.write_text(csv_header() + "".join(csv_row(f, k / 60) for k, f in enumerate(frames)))
+    path.write_text(_text(frames))
     return path
 
 
@@ -210,7 +255,7 @@ def _frames_log_serial(count: int = 300) -> list[Frame]:
 def test_frames_are_rows(ending: str, tmp_path: Path) -> None:
     frames, path, table = _frames_log_serial(), tmp_path / f"log{ending}", tmp_path / "log.csv"
     path.write_bytes(b"boot: hello\r\n\xa5" + b"".join(map(encoded, frames)) + encoded(frames[0])[:20])
-    table.write_text(csv_header() + "".join(csv_row(frame, k / 60) for k, frame in enumerate(frames)))
+    table.write_text(_text(frames))
     log, same = read_log(path), read_log(table)
     assert log.columns.keys() == same.columns.keys() and log.t_s.tolist() == same.t_s.tolist()
     for name, values in log.columns.items():

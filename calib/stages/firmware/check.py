@@ -76,7 +76,8 @@ def read_frames(path: Path) -> list[Frame]:
         missing = [name for name in BOARD_COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise BadInputError(f"{shown(path)}: has no column {missing[0]}, expected a log of calib record")
-        frames += [frame_from_row(row) for row in reader]
+        # Rows of a picture alone are no ticks.
+        frames += [frame_from_row(row) for row in reader if row["sequence"] != ""]
     except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
         raise BadInputError(
             f"{shown(path)}: line {reader.line_num} is no tick of a board ({error})"

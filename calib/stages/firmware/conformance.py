@@ -77,6 +77,12 @@ def older(age: int) -> int:
     return age if age >= _NEVER - 1 else age + 1
 
 
+def late(given: Inputs) -> float:
+    """Ticks, 0 to 1, by which the picture comes later than the logs' delay says."""
+    known = 0.0 <= given.late_ticks <= 1.0 and math.copysign(1.0, given.late_ticks) > 0.0
+    return given.late_ticks if known else 1.0
+
+
 def clip(value: float, limit: float) -> float:
     """A value within +-limit."""
     return min(max(value, -limit), limit)
@@ -101,7 +107,7 @@ class Reference:
         pairs, singles = int(self.c["LOWPASS_PAIRS"]), int(self.c["LOWPASS_SINGLES"])
         self.memory = _Memory(
             lowpass=[[0.0] * (2 * pairs + singles) for _ in range(2)],
-            past=[0.0] * int(self.c["TIME_OFFSET_TICKS"]),
+            past=[0.0] * (int(self.c["TIME_OFFSET_TICKS"]) + 1),
             integral=self.c["MM_GYRO_BIAS_DT_RAD"],
         )
         self.count = dict.fromkeys(COUNTERS, 0)
@@ -207,10 +213,10 @@ class Reference:
         m.marker_age = 0
         return 0, afresh
 
-    def _then(self) -> float:
+    def _then(self, given: Inputs) -> float:
         """The angle when the picture was exposed."""
         line = [*self.memory.past, self.memory.phi]
-        return line[0] + (self.c["TIME_OFFSET_PART"] * (line[1] - line[0]) if len(line) > 1 else 0.0)
+        return float(np.interp(1.0 + self.c["TIME_OFFSET_PART"] - late(given), np.arange(len(line)), line))
 
     def _lowpass(self, axis: int, x: float, afresh: bool) -> float:
         """Direct form on the difference equation's own coefficients, unlike the firmware's forms."""
@@ -322,13 +328,12 @@ class Reference:
             head, turned = (0.0, c["REST_LENGTH_M"]), c["BELLOWS_RADIUS_M"] * phi
             q = (c["REST_LENGTH_M"] + turned, c["REST_LENGTH_M"] - turned)
         else:
-            then = self._then()
+            then = self._then(given)
             d = c["MARKER_OFFSET_M"]
             x, y = m.marker[0] - d * math.sin(then), m.marker[1] - d * math.cos(then)
             head = (self._lowpass(0, x, afresh), self._lowpass(1, y, afresh))
             q = self.bellows(*head, phi, then)
-        if m.past:
-            m.past = [*m.past[1:], phi]
+        m.past = [*m.past[1:], phi]
         return flags, head, q, 0.0
 
     def step(self, given: Inputs, decided: int | None = None) -> Wanted:
@@ -401,7 +406,7 @@ class FusedReference(Reference):
     def _turn(self, given: Inputs) -> tuple[int, bool, float, float]:
         """Flags, whether the IMU's sample is used, and gravity along and across the head."""
         c, m, f = self.c, self.memory, self.fused
-        A = B = 0.0
+        A = B = turned = 0.0
         flags, sampled = 0, self._sampled(given)
         if sampled:
             ax, ay = c["IMU_SIGN_AX"] * given.ax_mps2, c["IMU_SIGN_AY"] * given.ay_mps2
@@ -413,12 +418,13 @@ class FusedReference(Reference):
                 flags = ACCEL_WEAK
             if min(m.imu_age, m.marker_age) <= c["HOLD_TICKS"]:
                 before = half if self.mean_rate or m.imu_age else f.half
-                m.phi += half + before + f.bias
+                turned = half + before + f.bias
+                m.phi += turned
             elif flags:
                 sampled = False
             else:
                 m.phi = clip(math.atan2(B, A), c["PHI_LIMIT_RAD"])
-                m.past = [m.phi] * len(m.past)
+                m.past = [0.0] * len(m.past)
             f.half = half
         if sampled:
             m.imu_age = 0
@@ -426,7 +432,13 @@ class FusedReference(Reference):
             m.imu_age = older(m.imu_age)
             self._counted("imu")
             flags |= IMU_HELD
+        m.past = [*m.past[1:], turned]
         return flags, sampled, A, B
+
+    def _then(self, given: Inputs) -> float:
+        m, delay = self.memory, self.c["FUSED_DELAY_TICKS"] + late(given)
+        line = m.phi - np.cumsum([0.0, *reversed(m.past)])
+        return clip(float(np.interp(delay, np.arange(len(line)), line)), self.c["PHI_LIMIT_RAD"])
 
     def _picture(
         self, then: float, age: int, afresh: bool, sampled: bool, decided: int | None
@@ -480,14 +492,14 @@ class FusedReference(Reference):
         flags |= BY_FUSED | (BY_MEAN_RATE if self.mean_rate else 0)
         seen, afresh = self._marker(given)
         flags |= seen
-        then = self._then()
+        then = self._then(given)
         correction = 0.0
         if sampled and not flags & ACCEL_WEAK:
             whole = c["FUSED_ACCEL_GAIN"]
             pull = B * math.cos(then) - A * math.sin(then) - whole * (m.phi - then)
             correction = clip(pull, whole)
         f.length += f.rate
-        f.chord = sinc(0.5 * then) * (f.length - c["FUSED_DELAY_TICKS"] * f.rate)
+        f.chord = sinc(0.5 * then) * (f.length - (c["FUSED_DELAY_TICKS"] + late(given)) * f.rate)
         if flags & MARKER_HELD:
             f.rate *= c["FUSED_RATE_DECAY"]
         else:
@@ -501,8 +513,6 @@ class FusedReference(Reference):
         if abs(m.phi) > limit:
             m.phi = clip(m.phi, limit)
             flags |= ANGLE_LIMIT
-        if m.past:
-            m.past = [*(clip(angle + correction, limit) for angle in m.past[1:]), m.phi]
         turned = c["BELLOWS_RADIUS_M"] * m.phi
         head = (f.chord * math.sin(0.5 * then), f.chord * math.cos(0.5 * then))
         return flags, head, (f.length + turned, f.length - turned), undecided

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from calib.stages.firmware.conformance import (
     REFERENCE_LIMIT,
     Reference,
     binary32,
+    late,
     reference_of,
     sinc,
 )
@@ -37,6 +38,8 @@ FUSED_TICKS = 72
 
 
 _SHAKEN_RAD = (1.96, 2.75)
+_LATE_STEP, _LATE_FROM, _LATE_KINDS = 0.25, -0.25, 8
+"""Lateness of pictures among the ticks, what is refused included: whole multiples, as three bits hold."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +85,17 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
             gz_radps=bias + 2.5 * math.sin(7.0 * turn),
             reference=reference,
             mode=mode,
+            late_ticks=_lateness(k),
         )
         made.append(binary32(spoilt(given, k)))
     return made
 
 
 _TO_LIMIT = 30
+
+
+def _lateness(k: int) -> float:
+    return _LATE_FROM + _LATE_STEP * ((3 * k + 2) % _LATE_KINDS)
 
 
 def _weak(c: Mapping[str, float], factor: float, fused: bool) -> dict[str, Any]:
@@ -233,7 +241,7 @@ _TOGETHER = 4.0
 
 def _row(vector: Vector) -> list[float]:
     """Inputs and the weighted sum of what a tick gives; zero for what is too small for a normal float."""
-    inputs = [_NAN if math.isnan(value) else value for value in vector.given.numbers]
+    inputs = [_NAN if math.isnan(value) else value for value in vector.given.numbers[:-1]]
     row = [*inputs, float(np.dot(_WEIGHTS, vector.wanted.numbers))]
     return [float(v) if abs(v) > 1e-30 else 0.0 for v in row]
 
@@ -254,11 +262,14 @@ def _points(constants: Mapping[str, float]) -> list[list[float]]:
 
 
 def _words(made: list[Vector]) -> list[int]:
-    """What came with the inputs, mode and repetitions, and flags, two for each tick."""
-    words = [
-        (one.given.sensors + 4 * one.given.mode + 32 * (one.times - 1), one.wanted.flags) for one in made
-    ]
-    return [word for pair in words for word in pair]
+    """What came with the inputs, mode, repetitions and lateness, and flags, two for each tick."""
+    words = []
+    for one in made:
+        kind = round((one.given.late_ticks - _LATE_FROM) / _LATE_STEP)
+        assert one.times <= 256
+        words += [one.given.sensors + 4 * one.given.mode + 32 * (one.times - 1) + 8192 * kind]
+        words += [one.wanted.flags]
+    return words
 
 
 def selftest_rows(constants: Mapping[str, float]) -> dict[str, Any]:
@@ -276,6 +287,7 @@ def selftest_rows(constants: Mapping[str, float]) -> dict[str, Any]:
         "fused_counts": fused[-1].counts if fused else plain[-1].counts,
         "tolerance": TOLERANCE,
         "weights": list(_WEIGHTS),
+        "late": (_LATE_STEP, _LATE_FROM),
         "limit": _TOGETHER,
     }
 
@@ -363,13 +375,18 @@ def _readings(c: Mapping[str, float], phi: float, rate: float) -> tuple[float, f
 
 
 def coherent(
-    constants: Mapping[str, float], ticks: int, undistort: bool | None = None, period: int = PERIOD
+    constants: Mapping[str, float],
+    ticks: int,
+    undistort: bool | None = None,
+    period: int = PERIOD,
+    lateness: Callable[[int], float] = _lateness,
 ) -> list[Inputs]:
     """Readings of one motion, in either mode of control.
 
     Parameters
     ----------
     constants : of a header that has the estimator, by name. undistort : CALIB_UNDISTORT.
+    lateness : of a tick's picture [ticks].
     """
     reference = Reference(constants, undistort)
     c = reference.c
@@ -377,7 +394,8 @@ def coherent(
     motion, d, made = Motion(c["REST_LENGTH_M"], period, creep), c["MARKER_OFFSET_M"], []
     last: tuple[float, float] | None = None
     for k in range(ticks):
-        phi, length = motion.at(k - c["FUSED_DELAY_TICKS"])
+        given = Inputs(0.0, 0.0, 0.0, 0.0, 0.0, late_ticks=lateness(k))
+        phi, length = motion.at(k - c["FUSED_DELAY_TICKS"] - late(given))
         chord = length * sinc(0.5 * phi)
         X = chord * math.sin(0.5 * phi) + d * math.sin(phi)
         Y = chord * math.cos(0.5 * phi) + d * math.cos(phi)
@@ -388,7 +406,8 @@ def coherent(
         mode = (MODE_POSITION, MODE_ORIENTATION)[(3 * k // period) % 2]
         wanted = motion.at(k)[1] * (1.0 + 0.05 * math.sin(0.11 * k))
         noisy = 0.3 * (k % period < _SWING * period)
-        given = Inputs(
+        given = replace(
+            given,
             u_px=u + noisy * math.sin(1.7 * k),
             v_px=v + noisy * math.cos(2.3 * k),
             ax_mps2=ax + shaken * math.sin(0.9 * k),

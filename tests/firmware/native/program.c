@@ -64,7 +64,7 @@ int main(void) {
 }
 #else
 int main(int argc, char **argv) {
-    unsigned char bytes[31];
+    unsigned char bytes[35];
     (void)argv;
     calib_start(&state);
 #ifdef CALIB_GUARDED

@@ -48,10 +48,10 @@ static FILE *out;
 static unsigned char from_board[65536], to_board[4096];
 static size_t came, to_board_at, to_board_end;
 static unsigned addressed, index_, place, resets, wanted;
-static unsigned char written[8], reply[32];
+static unsigned char written[8], reply[32], answer[sizeof reply];
 static unsigned char registers[256], second[8]; /* `second`: of the BNO055, places 0x08 to 0x0F of page 1 */
 static unsigned noise = 1;
-static int quiet, of_caller, shown[9]; /* force, rate in the sensor's units; marker seen, u, v */
+static int quiet, of_caller, shown[10]; /* force, rate in the sensor's units; marker seen, u, v; number of the picture */
 static avr_irq_t *spi_in;
 
 static double now_ms(void) {
@@ -180,13 +180,19 @@ static void pixy_reply(void) {
     double share = 0.5 * (length[0] + length[1]), phi = angle(), sum = 0, chord, across;
     unsigned i, from = is("pixy_shifted") ? 3 : 0, total = 0;
     unsigned char *r = reply + from;
+    static int given;
+    int picture = of_caller ? shown[9] : 1 + (int)(now_ms() * 0.06);
     memset(reply, 0, sizeof reply);
     if (is("blob_lost") || (is("camera_slow") && fmod(now_ms() - at_ms, 1000.0) < 980.0)) {
         return;
     }
-    if (of_caller && !shown[6]) {
+    if (picture == given || (of_caller && !shown[6])) {
+        /* Busy: this picture was given. */
+        static const unsigned char busy[] = {0xAF, 0xC1, 0x03, 0x01, 0xFE, 0x00, 0xFE};
+        memcpy(r, busy, sizeof busy);
         return;
     }
+    given = picture;
     if (is("beyond_reach")) {
         share = 1.6;
     }
@@ -246,7 +252,12 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
             addressed = slave;
             wanted = v.u.twi.addr;
             if (wanted & 1) {
-                (slave == 0x28 ? imu_reply : slave == 0x68 ? mpu_reply : pixy_reply)();
+                if (slave == 0x54) {
+                    memcpy(reply, answer, sizeof reply);
+                    memset(answer, 0, sizeof answer);
+                } else {
+                    (slave == 0x28 ? imu_reply : mpu_reply)();
+                }
             }
             avr_raise_irq(bus_in, avr_twi_irq_msg(TWI_COND_ACK, (uint8_t)wanted, 1));
         }
@@ -258,6 +269,10 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
         avr_raise_irq(bus_in, avr_twi_irq_msg(TWI_COND_ACK, (uint8_t)wanted, 1));
         if (index_ < sizeof written) {
             written[index_++] = v.u.twi.data;
+        }
+        if (addressed == 0x54 && index_ == 6 && written[0] == 0xAE && written[1] == 0xC1) {
+            pixy_reply();
+            memcpy(answer, reply, sizeof answer);
         }
         if (addressed != 0x54) {
             place = written[0];
@@ -279,7 +294,7 @@ static void on_bus(struct avr_irq_t *irq, uint32_t value, void *param) {
 
 /* The Pixy2 on SPI: each byte of the board's gets one of the answer to what was asked before. */
 static void on_spi(struct avr_irq_t *irq, uint32_t value, void *param) {
-    static unsigned char asked[2], answer[sizeof reply];
+    static unsigned char asked[2];
     static unsigned sent = sizeof reply;
     (void)irq;
     (void)param;
@@ -350,7 +365,7 @@ int rig_open(const char *path) {
     return opened(path);
 }
 
-/* Whole numbers: force (3), rate (3) as the BNO055 counts, whether the marker is seen, u, v. */
+/* Whole numbers: force (3), rate (3) as the BNO055 counts, whether the marker is seen, u, v, the picture's number. */
 void rig_show(const int *numbers) {
     memcpy(shown, numbers, sizeof shown);
 }

@@ -1,6 +1,6 @@
 /*
  * Runs program.c on a simulated ATmega328P. As a program, runner PROGRAM.elf IN_ADDRESS OUT_ADDRESS FREE_ADDRESS:
- * records of 31 bytes on stdin; on stdout the 40 bytes of the outputs and eight counts of cycles: stages 1 to 6 with
+ * records of 35 bytes on stdin; on stdout the 40 bytes of the outputs and eight counts of cycles: stages 1 to 6 with
  * 0 for what lies before the first, and the whole. The stack's greatest depth goes to stderr at the end.
  * As a shared library, runner_open and runner_tick: a tick for each call, without pipes between.
  */
@@ -16,7 +16,7 @@
 #define PATTERN 0xC5
 #define GPIOR0 0x3E
 #define GPIOR1 0x4A
-#define IN_BYTES 31
+#define IN_BYTES 35
 #define OUT_BYTES 40
 
 /* Nothing but the program is at work on the chip, so the core may run this far before it looks for timers. */
