@@ -64,7 +64,7 @@
 #define CALIB_WORD_READ(address) (*(address))
 #endif
 
-#define CALIB_SCHEMA 7
+#define CALIB_SCHEMA 8
 #if defined(CALIB_EXPECT_SCHEMA)
 #if CALIB_EXPECT_SCHEMA != CALIB_SCHEMA
 #error "calib: this header has another schema than the code expects"
@@ -158,7 +158,7 @@
 #define CALIB_TICK_RATE_HZ 60.0f /* ticks per second, Hz */
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
-#define CALIB_TIME_OFFSET_TICKS 0 /* ceil(D), angles that are remembered; D ticks by which a picture is later than the IMU */
+#define CALIB_TIME_OFFSET_TICKS 0 /* ceil(D), for D ticks by which a picture is later than the IMU */
 #define CALIB_TIME_OFFSET_PART 0.0f /* ceil(D) - D, share of a tick */
 
 /*

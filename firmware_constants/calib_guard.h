@@ -18,8 +18,8 @@
  *                            or more than a fifth of them for long
  *   CALIB_FAULT_IMU_FROZEN   12 times the very same sample, or 72 times the same  by itself
  *                            rate or the same force
- *   CALIB_FAULT_CAMERA_LOST  15 pictures without a marker, or more than a        by itself
- *                            fifth of them for long, where a mode needs them
+ *   CALIB_FAULT_CAMERA_LOST  the marker not seen for 15 ticks, or for two in     by itself
+ *                            more than a fifth of them, where a mode needs it
  *   CALIB_FAULT_CAMERA_FROZEN the marker on one pixel while the angle turns      by itself
  *   CALIB_FAULT_APART        marker and angle of two places for half a second    by itself
  *   CALIB_FAULT_REACH        angle or lengths beyond the envelope for 6 ticks    by calib_guard_clear
@@ -82,7 +82,7 @@ extern "C" {
 /* A bad tick counts four times what a good one takes away: a fifth of bad ones is too many. */
 #define CALIB_GUARD_BAD 4
 #define CALIB_GUARD_IMU_BAD (12 * CALIB_GUARD_BAD)
-#define CALIB_GUARD_CAMERA_BAD (15 * CALIB_GUARD_BAD)
+#define CALIB_GUARD_CAMERA_BAD (14 * CALIB_GUARD_BAD)
 #define CALIB_GUARD_SAME 12
 /* Of one sensor alone. At rest a gyroscope whose noise is 0.4 of its step repeats itself four times of five. */
 #define CALIB_GUARD_SAME_ONE 72
@@ -229,9 +229,11 @@ static inline uint8_t calib_guard_imu(calib_guard *guard, const calib_state *sta
 /* Health of the camera, by itself and against the angle; the latter is spread over four ticks. */
 static inline uint8_t calib_guard_camera(calib_guard *guard, const calib_state *state, const calib_inputs *in,
                                          const calib_outputs *out) {
-    uint8_t lost = (uint8_t)(state->marker_age != 0);
-    guard->camera_bad = calib_guard_counted(guard->camera_bad, lost, CALIB_GUARD_CAMERA_BAD);
-    if (!lost) {
+    uint8_t shown = (uint8_t)(state->marker_age == 0);
+    /* Where pictures come as often as ticks and with them, each second or third tick has none and the next has two. */
+    guard->camera_bad =
+        calib_guard_counted(guard->camera_bad, (uint8_t)(state->marker_age > 1), CALIB_GUARD_CAMERA_BAD);
+    if (shown) {
         uint32_t u = calib_bits(in->u_px), v = calib_bits(in->v_px);
         if (u != guard->pixel[0] || v != guard->pixel[1]) {
             guard->pixel[0] = u;
@@ -250,7 +252,7 @@ static inline uint8_t calib_guard_camera(calib_guard *guard, const calib_state *
         guard->tangent = phi * (0.5f + phi * phi * 0.0416666679f);
         guard->marker_m[0] = out->marker_m[0];
         guard->marker_m[1] = out->marker_m[1];
-        guard->shown = (uint8_t)!lost;
+        guard->shown = shown;
     } else if (guard->turn == 1 && guard->shown) {
         float across = guard->marker_m[0] - guard->tangent * (guard->marker_m[1] + CALIB_MARKER_OFFSET_M);
         uint8_t off = (uint8_t)!calib_within(across, CALIB_ENVELOPE_APART_M);
@@ -365,7 +367,7 @@ static inline void calib_trial_sound(calib_trial *of, uint8_t k) {
     float phi = 0.8f * CALIB_ENVELOPE_ANGLE_RAD, h = 0.5f * phi, w = h * h;
     uint8_t third = (uint8_t)(k % 6u);
     of->state.imu_age = 0;
-    of->state.marker_age = 0;
+    of->state.marker_age = (uint16_t)((k & 15u) == 15u);
     of->in.imu_read = 1;
     of->in.ax_mps2 = (uint8_t)(third - 1u) < 3u ? 9.01f : 9.0f;
     of->in.ay_mps2 = (uint8_t)(third - 2u) < 3u ? 0.51f : 0.5f;
@@ -448,10 +450,10 @@ static inline uint16_t calib_guard_try(calib_trial *of, uint8_t fault, uint8_t k
         case CALIB_FAULT_NONE:
             mode = CALIB_MODE_ORIENTATION;
             of->in.reference[0] = 0.0f;
-            of->state.marker_age = 1;
+            of->state.marker_age = 2;
             break;
         case CALIB_FAULT_CAMERA_LOST:
-            of->state.marker_age = (uint16_t)(k & 1u || !kind);
+            of->state.marker_age = (uint16_t)(k & 1u || !kind ? 2 : 0);
             break;
         case CALIB_FAULT_CAMERA_FROZEN:
             mode = CALIB_MODE_ORIENTATION;
@@ -592,8 +594,8 @@ static inline uint8_t calib_guard_selftest(void) {
         {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
         {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_IMU_FROZEN, 1, 71, 61},
         {CALIB_FAULT_IMU_FROZEN, 2, 73, 63},
-        {CALIB_FAULT_CAMERA_LOST, 0, 15, 119},
-        {CALIB_FAULT_CAMERA_LOST, 1, 39, 119},  {CALIB_FAULT_CAMERA_FROZEN, 0, 8, 60},
+        {CALIB_FAULT_CAMERA_LOST, 0, 14, 115},
+        {CALIB_FAULT_CAMERA_LOST, 1, 37, 115},  {CALIB_FAULT_CAMERA_FROZEN, 0, 8, 60},
         {CALIB_FAULT_CAMERA_FROZEN, 1, 7, 60},
         {CALIB_FAULT_APART, 0, 30, 62},         {CALIB_FAULT_APART, 1, 30, 62},
         {CALIB_FAULT_REFERENCE, 0, 1, 28},      {CALIB_FAULT_REFERENCE, 1, 1, 28},

@@ -45,7 +45,7 @@
 #include <string.h>
 
 #ifndef CALIB_EXPECT_SCHEMA
-#define CALIB_EXPECT_SCHEMA 7
+#define CALIB_EXPECT_SCHEMA 8
 #endif
 #include "calib_constants.h"
 
@@ -117,11 +117,17 @@ extern "C" {
 #define CALIB_COUNTERS 7
 
 #define CALIB_LOWPASS_STATES (2 * CALIB_LOWPASS_PAIRS + CALIB_LOWPASS_SINGLES)
+#define CALIB_PAST_TICKS (CALIB_TIME_OFFSET_TICKS + 1) /* that are remembered */
+
+/* Floats at the beginning of what goes in and what comes out. */
+#define CALIB_INPUT_FLOATS 8
+#define CALIB_OUTPUT_FLOATS 9
 
 typedef struct {
     float u_px, v_px;                     /* marker as the camera reports it */
     float ax_mps2, ay_mps2, gz_radps;     /* readings of the IMU */
     float reference[2];                   /* see the modes */
+    float late_ticks;                     /* ticks since the picture had its time in the logs, 0 to 1 */
     uint8_t marker_seen, imu_read;        /* 0: nothing came in this tick */
     uint8_t mode;
 } calib_inputs;
@@ -147,6 +153,7 @@ typedef struct {
 #if CALIB_FUSED
     float bias_rad, half_rad;             /* what the gyroscope turns too little in a tick; T / 2 times its rate */
     float length_m, rate_m, slow_m;       /* length, its change in a tick, mean residual */
+    float turned_rad[CALIB_PAST_TICKS];   /* what the gyroscope turned in the last ticks, the oldest first */
     uint8_t boost, moving, rejected;
 #else
     float integral_rad;                   /* J of (2.3), from the gyroscope's known bias on */
@@ -157,9 +164,7 @@ typedef struct {
     uint8_t step;                         /* entry of the tables of gains */
 #endif
     float lowpass[2][CALIB_LOWPASS_STATES];
-#endif
-#if CALIB_TIME_OFFSET_TICKS > 0
-    float past_rad[CALIB_TIME_OFFSET_TICKS]; /* angles of the last ticks, the oldest first */
+    float past_rad[CALIB_PAST_TICKS];     /* angles of the last ticks, the oldest first */
 #endif
     calib_channel channel[2];
     uint16_t marker_age, imu_age;         /* ticks since the last good one, from CALIB_NEVER */
@@ -335,19 +340,35 @@ static inline uint8_t calib_sampled(const calib_inputs *in) {
 #define CALIB_GZ(in) ((in)->gz_radps)
 #endif
 
+/* How late the picture comes beyond the logs' delay, in ticks: within 0 to 1, whatever the program says. */
+static inline float calib_late(const calib_inputs *in) {
+    return calib_bits(in->late_ticks) <= calib_bits(1.0f) ? in->late_ticks : 1.0f;
+}
+
 /* The angle at the time of the picture, for all that is of the picture; phi is that of this tick. */
-static inline float calib_then(const calib_state *state, float phi) {
-    (void)state;
+#if CALIB_FUSED
+static inline float calib_then(const calib_state *state, float phi, float delay) {
+    const float *turned = state->turned_rad + CALIB_PAST_TICKS - 1;
+    while (calib_bits(delay) > calib_bits(1.0f) && turned != state->turned_rad) {
+        phi -= *turned--;
+        delay -= 1.0f;
+    }
+    return calib_clip(phi - delay * *turned, CALIB_PHI_LIMIT_RAD);
+}
+#else
+static inline float calib_then(const calib_state *state, float phi, float late) {
+    float part = CALIB_TIME_OFFSET_PART - late;
     (void)phi;
 #if CALIB_TIME_OFFSET_TICKS > 1
-    /* Two products, as a difference of two angles that are nearly alike takes longer on an AVR. */
-    return (1.0f - CALIB_TIME_OFFSET_PART) * state->past_rad[0] + CALIB_TIME_OFFSET_PART * state->past_rad[1];
+    float there = state->past_rad[1], next = state->past_rad[2];
 #elif CALIB_TIME_OFFSET_TICKS > 0
-    return (1.0f - CALIB_TIME_OFFSET_PART) * state->past_rad[0] + CALIB_TIME_OFFSET_PART * phi;
+    float there = state->past_rad[1], next = phi;
 #else
-    return phi;
+    float there = phi, next = phi;
 #endif
+    return there + part * (calib_negative(part) ? there - state->past_rad[0] : next - there);
 }
+#endif
 
 #if !CALIB_FUSED
 #if CALIB_LEVELLING
@@ -586,18 +607,26 @@ static inline void calib_lowpass_settle(float *s, float x) {
 #endif
 }
 #else
+/* Half of a finite number, by its exponent; one below 1e-37 stays. */
+static inline float calib_half(float value) {
+    uint32_t bits = calib_bits(value);
+    if (bits & 0x7F000000UL) {
+        bits = (uint32_t)(bits - 0x00800000UL);
+    }
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
 /*
  * The fused estimator. A picture tells where the head was when it was exposed; with h half the angle of then, see
  * calib_then, the marker's place across the chord tells that angle's error, its place along the chord the length,
  * without root or arc tangent. Returns flags.
  */
 static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, calib_outputs *out) {
-    float phi = state->phi_rad, A = 0.0f, B = 0.0f, half, then, h, w, s, sh, ch, chord, c = 0.0f;
+    float phi = state->phi_rad, turned = 0.0f, A = 0.0f, B = 0.0f, half, then, h, w, s, sh, ch, chord, c = 0.0f;
     uint16_t flags = 0, age = state->marker_age;
-    uint8_t sampled = calib_sampled(in), afresh;
-#if CALIB_TIME_OFFSET_TICKS > 0
-    uint8_t i;
-#endif
+    uint8_t sampled = calib_sampled(in), afresh, i;
+    float delay = CALIB_FUSED_DELAY_TICKS + calib_late(in);
     if (sampled) {
         float ax = CALIB_AX(in), ay = CALIB_AY(in);
         /* Gravity's share along and across the head, times the accelerometer's gain. */
@@ -609,20 +638,17 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
         }
         if (state->imu_age <= CALIB_HOLD_TICKS || age <= CALIB_HOLD_TICKS) {
 #if CALIB_RATE_IS_MEAN
-            phi += half + half + state->bias_rad;
+            turned = half + half + state->bias_rad;
 #else
-            phi += half + (state->imu_age ? half : state->half_rad) + state->bias_rad;
+            turned = half + (state->imu_age ? half : state->half_rad) + state->bias_rad;
 #endif
+            phi += turned;
         } else if (flags) {
             sampled = 0;
         } else {
             /* Nothing is known of the angle: the accelerometer's. */
             phi = calib_clip(calib_atan2(B, A), CALIB_PHI_LIMIT_RAD);
-#if CALIB_TIME_OFFSET_TICKS > 0
-            for (i = 0; i < CALIB_TIME_OFFSET_TICKS; i++) {
-                state->past_rad[i] = phi;
-            }
-#endif
+            memset(state->turned_rad, 0, sizeof state->turned_rad);
         }
         state->half_rad = half;
     }
@@ -631,11 +657,15 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
     } else {
         flags = (uint16_t)(flags | calib_imu_lost(state));
     }
+    for (i = 0; i + 1 < CALIB_PAST_TICKS; i++) {
+        state->turned_rad[i] = state->turned_rad[i + 1];
+    }
+    state->turned_rad[i] = turned;
     CALIB_STAGE(2);
     flags = (uint16_t)(flags | calib_marker(state, in, &afresh));
     CALIB_STAGE(3);
-    then = calib_then(state, phi);
-    h = 0.5f * then;
+    then = calib_then(state, phi, delay);
+    h = calib_half(then);
     w = h * h;
     s = calib_sinc_half(w);
     sh = h * s;
@@ -647,7 +677,7 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
     }
     CALIB_STAGE(4);
     state->length_m += state->rate_m;
-    chord = s * (state->length_m - CALIB_FUSED_DELAY_TICKS * state->rate_m);
+    chord = s * (state->length_m - delay * state->rate_m);
     if (flags & CALIB_MARKER_HELD) {
         state->rate_m *= CALIB_FUSED_RATE_DECAY;
     } else {
@@ -708,12 +738,6 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
         phi = calib_clip(phi, CALIB_PHI_LIMIT_RAD);
         flags = (uint16_t)(flags | CALIB_ANGLE_LIMIT);
     }
-#if CALIB_TIME_OFFSET_TICKS > 0
-    for (i = 0; i + 1 < CALIB_TIME_OFFSET_TICKS; i++) {
-        state->past_rad[i] = calib_clip(state->past_rad[i + 1] + c, CALIB_PHI_LIMIT_RAD);
-    }
-    state->past_rad[CALIB_TIME_OFFSET_TICKS - 1] = phi;
-#endif
     state->phi_rad = phi;
     CALIB_STAGE(5);
     out->phi_rad = phi;
@@ -911,7 +935,7 @@ static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_
     out->marker_m[0] = state->marker_m[0];
     out->marker_m[1] = state->marker_m[1];
 #else
-    uint8_t afresh, i;
+    uint8_t afresh;
     float phi, w;
 
     CALIB_STAGE(1);
@@ -926,7 +950,7 @@ static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_
 
     CALIB_STAGE(3);
     if (state->marker_age != CALIB_NEVER) {
-        float x, y, then = calib_then(state, phi);
+        float x, y, then = calib_then(state, phi, calib_late(in));
         w = then * then;
         x = state->marker_m[0] - calib_sin(CALIB_MARKER_OFFSET_M, then, w);
         y = state->marker_m[1] - calib_cos(CALIB_MARKER_OFFSET_M, w);
@@ -946,14 +970,8 @@ static inline void calib_tick(calib_state *state, const calib_inputs *in, calib_
         out->q_m[0] = CALIB_REST_LENGTH_M + CALIB_BELLOWS_RADIUS_M * phi;
         out->q_m[1] = CALIB_REST_LENGTH_M - CALIB_BELLOWS_RADIUS_M * phi;
     }
-#if CALIB_TIME_OFFSET_TICKS > 0
-    for (i = 0; i + 1 < CALIB_TIME_OFFSET_TICKS; i++) {
-        state->past_rad[i] = state->past_rad[i + 1];
-    }
-    state->past_rad[CALIB_TIME_OFFSET_TICKS - 1] = phi;
-#else
-    (void)i;
-#endif
+    memmove(state->past_rad, state->past_rad + 1, sizeof state->past_rad - sizeof phi);
+    state->past_rad[CALIB_PAST_TICKS - 1] = phi;
 #endif
 
     CALIB_STAGE(6);

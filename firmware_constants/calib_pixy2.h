@@ -3,7 +3,10 @@
  * The interface of a camera:
  *
  *   calib_camera_start()      once
- *   calib_camera_read(u, v)   once a tick: the answer to what was asked a tick before, and the next question
+ *   calib_camera_read(u, v)   the answer to the question before, and the next one; true once for each picture that
+ *                             shows the marker. The answer is of the time of its question: a Pixy2 gives each
+ *                             picture once, and says that it is busy until it has another
+ *   CALIB_CAMERA_POLL_US      time between questions, four times what one takes
  */
 #ifndef CALIB_CAMERA_H
 #define CALIB_CAMERA_H
@@ -16,10 +19,12 @@
 #include "calib_i2c.h"
 #define CALIB_CAMERA_KIND 2
 #define CALIB_CAMERA_ADDRESS 0x54
+#define CALIB_CAMERA_POLL_US (1250000000UL / CALIB_I2C_HZ)
 #else
 #include <Arduino.h>
 #include <SPI.h>
 #define CALIB_CAMERA_KIND 1
+#define CALIB_CAMERA_POLL_US 2000UL
 #endif
 
 #define CALIB_CAMERA_BLOCK 20  /* header of six bytes, block of fourteen */

@@ -17,7 +17,7 @@
  * started anew, ever more seldom.
  */
 #define CALIB_PROGMEM 1
-#define CALIB_EXPECT_SCHEMA 7
+#define CALIB_EXPECT_SCHEMA 8
 #define CALIB_EXPECT_PUMP_HIGH 255
 
 #include <Arduino.h>
@@ -55,7 +55,7 @@ static calib_outputs out;
 static calib_guard guard;
 static calib_link link;
 static uint16_t ticks, samples;
-static uint32_t next_us, sample_us, imu_us;
+static uint32_t next_us, sample_us, imu_us, asked_us, picture_us;
 static uint8_t sampling, overruns;
 static float force[3], rate[3];
 
@@ -198,6 +198,18 @@ static bool read_imu(void) {
     return came;
 }
 
+/* A picture is as old as the question that brought it, within half the time since the one before. */
+static void ask_camera(void) {
+    static uint32_t before_us;
+    uint32_t now_us = micros();
+    if (calib_camera_read(&in.u_px, &in.v_px)) {
+        in.marker_seen = 1;
+        picture_us = before_us + (asked_us - before_us) / 2;
+    }
+    before_us = asked_us;
+    asked_us = now_us;
+}
+
 static void send_hello(void) {
     calib_link_begin(&link, CALIB_LINK_HELLO, 16);
     calib_link_word(&link, samples, 2);
@@ -212,31 +224,26 @@ static void send_hello(void) {
     calib_link_end(&link);
 }
 
+static void send_guard(void) {
+    calib_link_byte(&link, out.duty[0]);
+    calib_link_byte(&link, out.duty[1]);
+    calib_link_byte(&link, guard.state);
+    calib_link_byte(&link, guard.fault);
+    calib_link_byte(&link, kept_fault);
+}
+
 static void send_tick(void) {
-    calib_link_begin(&link, CALIB_LINK_TICK, 87);
+    calib_link_begin(&link, CALIB_LINK_TICK, 91);
     calib_link_word(&link, imu_us, 4);
     calib_link_word(&link, CALIB_ID, 4);
     calib_link_word(&link, CALIB_TICK_RATE_MHZ, 4);
     calib_link_word(&link, ticks++, 2);
     calib_link_byte(&link, (uint8_t)(in.marker_seen | (in.imu_read << 1)));
     calib_link_byte(&link, in.mode);
-    calib_link_floats(&link, &in.u_px, 1);
-    calib_link_floats(&link, &in.v_px, 1);
-    calib_link_floats(&link, &in.ax_mps2, 1);
-    calib_link_floats(&link, &in.ay_mps2, 1);
-    calib_link_floats(&link, &in.gz_radps, 1);
-    calib_link_floats(&link, in.reference, 2);
-    calib_link_floats(&link, &out.phi_rad, 1);
-    calib_link_floats(&link, out.marker_m, 2);
-    calib_link_floats(&link, out.head_m, 2);
-    calib_link_floats(&link, out.q_m, 2);
-    calib_link_floats(&link, out.pwm, 2);
+    calib_link_floats(&link, &in.u_px, CALIB_INPUT_FLOATS);
+    calib_link_floats(&link, &out.phi_rad, CALIB_OUTPUT_FLOATS);
     calib_link_word(&link, out.flags, 2);
-    calib_link_byte(&link, out.duty[0]);
-    calib_link_byte(&link, out.duty[1]);
-    calib_link_byte(&link, guard.state);
-    calib_link_byte(&link, guard.fault);
-    calib_link_byte(&link, kept_fault);
+    send_guard();
     calib_link_end(&link);
 }
 
@@ -250,19 +257,14 @@ static void send_imu(void) {
 }
 
 /* The picture, what the pumps got `after_us` later, and how the board is. */
-static void send_picture(uint32_t picture_us, uint32_t after_us) {
+static void send_picture(uint32_t after_us) {
     calib_link_begin(&link, CALIB_LINK_PICTURE, 23);
     calib_link_word(&link, samples++, 2);
     calib_link_word(&link, picture_us, 4);
     calib_link_word(&link, after_us > 0xFFFFu ? 0xFFFFu : after_us, 2);
     calib_link_byte(&link, in.marker_seen);
-    calib_link_floats(&link, &in.u_px, 1);
-    calib_link_floats(&link, &in.v_px, 1);
-    calib_link_byte(&link, out.duty[0]);
-    calib_link_byte(&link, out.duty[1]);
-    calib_link_byte(&link, guard.state);
-    calib_link_byte(&link, guard.fault);
-    calib_link_byte(&link, kept_fault);
+    calib_link_floats(&link, &in.u_px, 2);
+    send_guard();
     calib_link_byte(&link, overruns);
     calib_link_end(&link);
 }
@@ -346,7 +348,8 @@ void setup() {
 
 void loop() {
     static uint8_t fresh;
-    uint32_t began_us = micros(), picture_us;
+    uint32_t began_us = micros();
+    int32_t late_us;
     if (sampling && (int32_t)(began_us - sample_us) >= 0) {
         sample_us += SAMPLE_US;
         if ((int32_t)(began_us - sample_us) >= 0) {
@@ -358,7 +361,11 @@ void loop() {
         }
         fresh = in.imu_read;
     }
-    if ((int32_t)(micros() - next_us) < 0) {
+    late_us = (int32_t)(next_us - micros());
+    if (late_us > 0) {
+        if (late_us > (int32_t)(CALIB_CAMERA_POLL_US / 2) && micros() - asked_us >= CALIB_CAMERA_POLL_US) {
+            ask_camera();
+        }
         return;
     }
     watched();
@@ -376,8 +383,12 @@ void loop() {
     } else {
         read_imu();
     }
-    picture_us = micros();
-    in.marker_seen = calib_camera_read(&in.u_px, &in.v_px);
+    ask_camera();
+    if (!in.marker_seen) {
+        picture_us = micros();
+    }
+    late_us = (int32_t)(imu_us - picture_us);
+    in.late_ticks = late_us > 0 ? (float)late_us * (1.0f / (float)TICK_US) : 0.0f;
     in.mode = calib_guard_mode(&guard, wanted_mode(), in.reference);
     calib_tick(&state, &in, &out);
     if (in.mode == CALIB_MODE_OPEN) {
@@ -392,10 +403,11 @@ void loop() {
     analogWrite(PUMP_PINS[1], out.duty[1]);
     if (!sampling) {
         send_tick();
-        return;
+    } else {
+        send_picture(micros() - picture_us);
+        if (++ticks % CALIB_HOLD_TICKS == 0) {
+            send_hello();
+        }
     }
-    send_picture(picture_us, micros() - picture_us);
-    if (++ticks % CALIB_HOLD_TICKS == 0) {
-        send_hello();
-    }
+    in.marker_seen = 0;
 }

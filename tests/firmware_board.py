@@ -42,8 +42,6 @@ __all__ = ["Board", "serve"]
 
 _NUMBERS = count()
 _STEP_S = 1.0 / 1200.0
-_FRAME_S = 1.0 / 60.7
-"""By the camera's own oscillator."""
 _FELT_HZ = 400.0
 _ACCEL_HZ = {code: (7.8125 * 2**code, 15.625 * 2**code) for code in range(8)}
 _GYRO_HZ = {0: (523, 2000), 1: (230, 2000), 2: (116, 1000), 3: (47, 400),
@@ -89,9 +87,10 @@ class Board:
     Attributes
     ----------
     duty : what drives the pumps. time_s : since the start. states : (n, 10) of the plant at the pictures.
+    frame_hz : pictures a second by the camera's own oscillator.
     """
 
-    def __init__(self, built: Built, seconds: float = 200.0, seed: int = 1) -> None:
+    def __init__(self, built: Built, seconds: float = 200.0, seed: int = 1, frame_hz: float = 60.7) -> None:
         # A library of its own, since the simulator lives in its variables.
         library = Path(built.program).with_suffix(f".{next(_NUMBERS)}.so")
         shutil.copy(built.library, library)
@@ -109,7 +108,8 @@ class Board:
         # Its oscillator is as good as such are.
         clock = 1.0 + 0.01 * (seed % 5 - 2)
         self._chip = _Sensor(_ACCEL_HZ, clock), _Sensor(_GYRO_HZ, clock)
-        frames = np.arange(int(seconds / _FRAME_S)) * _FRAME_S
+        self._frame_s = 1.0 / frame_hz
+        frames = np.arange(int(seconds * frame_hz)) * self._frame_s
         self._tracker = draw_tracker_noise(self.rig.tracker, frames, seed)
         self._shown = np.zeros(10, dtype=np.int32)
         self._taken = np.zeros(1 << 16, dtype=np.uint8)
@@ -180,7 +180,7 @@ class Board:
         self._past.append(self.row[:2].copy())
         self._steps += 1
         before, self.time_s = self.time_s, self._steps * _STEP_S
-        for period, show in ((1.0 / _FELT_HZ, self._sense), (_FRAME_S, self._show_picture)):
+        for period, show in ((1.0 / _FELT_HZ, self._sense), (self._frame_s, self._show_picture)):
             k = int(self.time_s / period + 1e-9)
             if k != int(before / period + 1e-9):
                 show(k)

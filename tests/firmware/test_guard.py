@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from firmware_board import Board
 from firmware_build import Built, need, sketch, warnings, write
 from firmware_rigs import header
 
@@ -157,6 +158,17 @@ def test_without_a_fault_it_starts_and_runs(board: Built) -> None:
     # And what was computed is what Python computes.
     result = check_frames(header(), ended.frames, "board")
     assert result.verdict.ok and result.ticks > 200 and result.worst["q_m"] < 2e-7
+
+
+def test_a_camera_with_nearly_the_ticks_rate_is_not_lost(board: Built) -> None:
+    """Pictures come with the ticks: for three seconds each third tick has none. The limit is a fifth."""
+    simulated = Board(board, frame_hz=60.1)
+    simulated.run(8.0)
+    frames = [one for one in Decoder().feed(simulated.everything()) if isinstance(one, Frame)]
+    missing = np.convolve([not one.given.marker_seen for one in frames], np.ones(120), "valid")
+    assert missing.max() > 36
+    states = [one.guard.state for one in frames if one.guard is not None]
+    assert set(states[states.index(GUARD_RUN) :]) == {GUARD_RUN}
 
 
 @pytest.mark.parametrize("fault", ["bus_hang", "marker_frozen", "beyond_reach"])
