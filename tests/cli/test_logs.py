@@ -9,6 +9,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from calib.core.rig import Rig
 from calib.io.columns import MEASURED
 from calib.io.logs import Log, read_log, write_log
 from calib.io.serial import Frame
+from calib.stages.firmware.conformance import reference_of
 from calib.stages.firmware.header import Header, header_of
 from calib.stages.firmware.vectors import vectors
 
@@ -203,10 +205,11 @@ serial = pytest.importorskip("serial")
 
 def _stream(header: Header, ticks: int = 90) -> bytes:
     identity, out = header.identity, b"\x00\xa5\x5a\x4ehalf a frame"
+    reference = reference_of(header.values)
     for k, vector in enumerate(vectors(header.values, ticks)):
-        w = vector.wanted
-        frame = Frame(identity, 60000, k, vector.given, w)
-        out += encoded(frame)
+        # As a sketch of before, without the picture's age.
+        inputs = replace(vector.given, late_ticks=0.0)
+        out += encoded(Frame(identity, 60000, k, inputs, reference.step(inputs)))
         if k % 20 == 10:
             out += b"\xa5\xa5\x5a\xff noise"
     return out
