@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,11 @@ from outside import NOT_HERE, outside
 # As the command does before numpy is loaded: on a busy machine waiting threads make small solves 400 times
 # slower (10.4 s and 0.024 s for one slope of a drift).
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+# Commands that tests start read what the first of them has compiled, where images of containers keep Python
+# from writing it: each took up to 2 s to compile `calib` again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # In CI the same examples each time, so that a change is judged by what it changed; elsewhere always new ones.
 settings.register_profile("ci", derandomize=True)

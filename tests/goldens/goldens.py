@@ -7,8 +7,8 @@ the rigs' working folders there to look at. The exit code is 1 when something di
 moves code leaves the goldens as they are; a commit that changes what a user sees refreshes them.
 `tests/goldens/test_goldens.py` runs the same comparison under pytest.
 
-Everything is driven through `python -m calib` in processes of their own, forked from one that has loaded the
-libraries, and nothing of `calib` is imported, so that modules can move without a change here. The words of
+Everything is driven through `python -m calib` in processes of their own, forked from one that has loaded
+every module, and no name of `calib` is used, so that modules can move without a change here. The words of
 a command are part of its golden: exit code, stdout, stderr, and the files that it wrote. Text must be
 equal, spaces included. Numbers are equal to 1e-9 of their size on x86-64 with the numpy and scipy that
 `.[test]` installs (`RELATIVE`, `FLOOR`); where
@@ -186,11 +186,15 @@ def _version() -> str:
 
 
 class _Forks:
-    """A process that has loaded the libraries, which takes longer than most commands, and forks each."""
+    """A process that has loaded all modules, which takes longer than most commands, and forks each."""
 
     SCRIPT = """
-import json, os, runpy, sys
-import cv2, jinja2, numba, numpy, pydantic, scipy.linalg, scipy.optimize, scipy.signal, typer, yaml
+import contextlib, importlib, json, os, pkgutil, runpy, sys
+import calib
+for module in pkgutil.walk_packages(calib.__path__, "calib."):
+    if module.name != "calib.__main__":
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module.name)
 for line in iter(sys.stdin.readline, ""):
     words, folder, *streams = json.loads(line)
     child = os.fork()
