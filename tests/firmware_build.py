@@ -109,16 +109,31 @@ def host(folder: Path, *flags: str, compiler: str = "gcc") -> list[str]:
     return [str(made)]
 
 
+@cache
+def _scratch() -> Path:
+    """A folder for what is compiled once in a run of tests."""
+    folder = Path(tempfile.mkdtemp(prefix="calib-core-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+@cache
+def _simulator(name: str) -> Path:
+    """A simulated board as a program, and beside it as a library."""
+    need("simavr")
+    need("gcc")
+    made = _scratch() / name
+    for target, flags in ((made, ()), (f"{made}.so", ("-fPIC", "-shared"))):
+        _compile(["gcc", "-O2", *flags, "-o", target, NATIVE / f"{name}.c", "-lsimavr", "-lm"])
+    return made
+
+
 def avr(folder: Path, *flags: str) -> tuple[list[str], dict[str, int]]:
     """The same for the ATmega328P, in the simulator; the command and the sizes in bytes."""
     need("avr-gcc")
-    need("simavr")
-    need("gcc")
-    made, runner = folder / "program.elf", folder / "runner"
+    made, runner = folder / "program.elf", _simulator("runner")
     target = ["-std=c99", "-Os", "-mmcu=atmega328p", "-DF_CPU=16000000UL", "-DCALIB_MEASURE"]
     _compile(["avr-gcc", *target, *warnings, *flags, f"-I{folder}", "-o", made, NATIVE / "program.c", "-lm"])
-    _compile(["gcc", "-O2", "-o", runner, NATIVE / "runner.c", "-lsimavr"])
-    _compile(["gcc", "-O2", "-fPIC", "-shared", "-o", f"{runner}.so", NATIVE / "runner.c", "-lsimavr"])
     listing = subprocess.run(["avr-nm", made], capture_output=True, text=True, check=True).stdout
     places = {name: f"0x{place}" for place, name in re.findall(r"^(\w+) \w (in|out|_end)$", listing, re.M)}
     sizes = subprocess.run(["avr-size", made], capture_output=True, text=True, check=True).stdout
@@ -157,24 +172,19 @@ _TARGET = ["-mmcu=atmega328p", "-Os", "-DF_CPU=16000000UL", "-DARDUINO=10819", "
 
 @cache
 def _core() -> tuple[Path, ...]:
-    """The Arduino core compiled, and the simulated rig as program and library: once in a run of tests."""
-    for tool in ("avr-gcc", "simavr", "gcc", "arduino"):
+    """The simulated rig, and the Arduino core compiled: once in a run of tests."""
+    for tool in ("avr-gcc", "arduino"):
         need(tool)
-    folder = Path(tempfile.mkdtemp(prefix="calib-core-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     core, wire = ARDUINO / "cores" / "arduino", ARDUINO / "libraries" / "Wire" / "src"
     names = ("main", "HardwareSerial", "HardwareSerial0", "Print", "Stream", "abi", "new")
     cpp = [*(core / f"{name}.cpp" for name in names), wire / "Wire.cpp", _LIBRARIES[1] / "SPI.cpp"]
     plain = [*sorted(core.glob("wiring*.c")), core / "hooks.c", wire / "utility" / "twi.c"]
     objects = []
     for path in (*cpp, *plain):
-        objects.append(folder / f"{path.name}.o")
+        objects.append(_scratch() / f"{path.name}.o")
         tool = ["avr-gcc"] if path.suffix == ".c" else ["avr-g++", "-std=gnu++11", "-fno-threadsafe-statics"]
         _compile([*tool, *_TARGET, "-w", "-c", path, "-o", objects[-1]])
-    rig = folder / "rig"
-    _compile(["gcc", "-O2", "-o", rig, NATIVE / "rig.c", "-lsimavr", "-lm"])
-    _compile(["gcc", "-O2", "-fPIC", "-shared", "-o", f"{rig}.so", NATIVE / "rig.c", "-lsimavr", "-lm"])
-    return rig, *objects
+    return _simulator("rig"), *objects
 
 
 def sketch(folder: Path, mode: str, *flags: str, made: Header | None = None) -> Built:
@@ -244,7 +254,8 @@ class Simulated:
     """
 
     def __init__(self, command: Sequence[str]) -> None:
-        library = ctypes.CDLL(f"{command[0]}.so")
+        # A library of its own, since the simulator lives in its variables.
+        library = ctypes.CDLL(shutil.copy(f"{command[0]}.so", f"{command[1]}.so"))
         addresses = [int(word, 0) & 0xFFFF for word in command[2:5]]
         assert library.runner_open(command[1].encode(), *addresses) == 0
         self.record, self.result = np.zeros(35, dtype=np.uint8), np.zeros(72, dtype=np.uint8)

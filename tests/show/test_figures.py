@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -346,6 +348,13 @@ CASES: dict[str, Callable[[Path], dict[str, Figure]]] = {
 }
 
 
+@cache
+def figures_of(name: str) -> dict[str, Figure]:
+    """The figures of a case, worked out once."""
+    with tempfile.TemporaryDirectory() as folder:
+        return CASES[name](Path(folder))
+
+
 def _decoded(entry: list[Any]) -> FloatArray:
     """Numbers of an array of a chart, as the page's script reads them."""
     kind, text, *scale = entry
@@ -389,8 +398,8 @@ QUICK = (
 @pytest.mark.parametrize(
     "name", [c if c in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in CASES]
 )
-def test_all_figures_are_legible(name: str, tmp_path: Path) -> None:
-    figures = CASES[name](tmp_path)
+def test_all_figures_are_legible(name: str) -> None:
+    figures = figures_of(name)
     assert figures
     for stem, figure in figures.items():
         assert complaints(figure) == [], stem
@@ -398,7 +407,7 @@ def test_all_figures_are_legible(name: str, tmp_path: Path) -> None:
 
 
 def test_files_are_the_same_bytes_again(tmp_path: Path) -> None:
-    figures = CASES["low-pass: order 1"](tmp_path)
+    figures = figures_of("low-pass: order 1")
     first, again = (write_figures(tmp_path / name, figures) for name in ("a", "b"))
     assert [path.name for path in first] == [f"{name}.png" for name in figures]
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(first, again, strict=True))
@@ -422,8 +431,8 @@ def test_files_are_the_same_bytes_again(tmp_path: Path) -> None:
         ("control: a jump checked", "control_check", "verdict: poor"),
     ],
 )
-def test_what_is_not_known_is_said(name: str, stem: str, words: str, tmp_path: Path) -> None:
-    assert words in words_of(CASES[name](tmp_path)[stem])
+def test_what_is_not_known_is_said(name: str, stem: str, words: str) -> None:
+    assert words in words_of(figures_of(name)[stem])
 
 
 FIT = calibrate(pack(views_of(12, noise_px=0.1)), (640, 480), "radial2")
