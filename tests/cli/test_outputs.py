@@ -144,9 +144,9 @@ def test_a_sketch_that_was_changed_stays(calib, place: Path) -> None:
     assert sketch.read_text() == mine
 
 
-def test_states_go_through_pipes(process, environment, place: Path) -> None:
+def test_states_go_through_pipes(calib, environment, place: Path) -> None:
     """Alone on stdout, so that another program can read them; words go to stderr."""
-    assert process("replay", "in.csv", "-o", "states.csv", cwd=place).code in (0, 1)
+    assert calib("replay", "in.csv", "-o", "states.csv", cwd=place).code in (0, 1)
     command = f"{sys.executable} -c 'from calib.cli.main import main; main()' replay in.csv"
     wanted = (place / "states.csv").read_text()
     for words in (
