@@ -329,6 +329,31 @@ def test_interlaced_and_sharpened_boards_are_found(shared_data: Path, frame: str
     assert found.misfit_px < 0.2
 
 
+def _shaded(gray: GrayImage, share: float) -> GrayImage:
+    """A shadow with a soft edge over the left half, with so much of the light."""
+    v, u = np.indices(gray.shape)
+    inside = 1.0 / (1.0 + np.exp((u - 0.5 * gray.shape[1] - 0.2 * v) / 6.0))
+    return np.asarray(gray * (1.0 - (1.0 - share) * inside)).astype(np.uint8)
+
+
+def _lit(gray: GrayImage, corners: FloatArray) -> GrayImage:
+    """A lamp's reflection over one square."""
+    v, u = np.indices(gray.shape)
+    side = np.linalg.norm(corners[1] - corners[0])
+    away = np.hypot(u - corners[20, 0] - 0.5 * side, v - corners[20, 1] - 0.5 * side)
+    return np.clip(gray + 255.0 * np.exp(-((away / (0.8 * side)) ** 4)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("camera", [VGA, PIXY], ids=["640x480", "316x208"])
+def test_boards_in_uneven_light_are_found(camera: Camera) -> None:
+    for seed in range(4):
+        gray, truth = _picture(camera, Board(9, 6, 0.025), seed)
+        assert np.sqrt(np.mean(_error(detect(_shaded(gray, 0.1), 9, 6), truth) ** 2)) < 0.03, seed
+        error = np.linalg.norm(_error(detect(_lit(gray, truth), 9, 6), truth), axis=1)
+        # The reflection moves the corners of the square that it lies on, and those beside it.
+        assert np.sum(error > 0.05) <= 12 and np.median(error) < 0.02, seed
+
+
 def test_boards_whose_white_is_clipped_are_found() -> None:
     """Most of the light squares' brightness is missing, and the fit's amplitude goes on beyond white."""
     for seed in range(4):
@@ -521,6 +546,9 @@ def test_boards_with_markers_are_not_read_as_plain_ones(share: float) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         assert detect(_finished(_seen(target, rng), rng), 6, 4) is None, seed
+        # Blur takes the markers' contrast away and leaves the squares'.
+        blurred = cv2.GaussianBlur(_seen(target, rng), (0, 0), 2.5)
+        assert detect(_finished(blurred, rng), 6, 4) is None, seed
 
 
 KINDS = [

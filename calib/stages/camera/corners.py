@@ -107,6 +107,11 @@ _MARKED_SHARE = 0.7
 """Largest share of bright squares that may show something in their middle: on boards with markers all do."""
 _LEAST_STEP = 0.38
 """Least step between neighbouring squares over the step at the corners."""
+_CLOSE_WEAK_SHARE = 0.1
+"""Largest share of such steps below it in a close grid: a lamp's reflection, or a logo, covers a square."""
+_RIM, _SAG = 0.3, 0.25
+"""So far on the way from its corners to its middle a bright square is at most this much of the step brighter
+than further on, beyond what a dark square is darker."""
 _FLAT = 0.6
 """Largest difference between the quarters of a square, over the step from dark to bright."""
 
@@ -128,8 +133,8 @@ def _turns_alike(points: FloatArray) -> bool:
     return True
 
 
-def _squares_are_plain(grid: Refined) -> bool:
-    """Whether the squares between the corners alternate and are of one tone each."""
+def _squares_are_plain(grid: Refined, close: bool) -> bool:
+    """Whether squares between corners alternate, a few of a close grid aside, and are of one tone each."""
     p = grid.part.from_picture(grid.points)
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]])
     middle = corners.mean(axis=0)
@@ -147,7 +152,17 @@ def _squares_are_plain(grid: Refined) -> bool:
         # Each square against the neighbours that share a side with it, which have the other colour.
         signed = np.where(bright, tone, -tone)
         across, down = signed[:, 1:] + signed[:, :-1], signed[1:] + signed[:-1]
-        if min(across.min(initial=np.inf), down.min(initial=np.inf)) < _LEAST_STEP * float(local.min()):
+        steps = np.concatenate([across.ravel(), down.ravel()])
+        weak = float(np.mean(steps < _LEAST_STEP * float(local.min())))
+        if weak > (_CLOSE_WEAK_SHARE if close else 0.0):
+            return False
+        # Blur makes a bright square brighter all the way to its middle, and a dark one darker. Sharpening
+        # turns that about in both, a marker in bright ones.
+        rim = sample(grid.part.image, corners + _RIM * (middle - corners) + around).mean(axis=(0, 1))
+        profile = tones.mean(axis=1)
+        sag = float(np.median((rim - profile.min(axis=0))[bright]))
+        rise = float(np.median((profile.max(axis=0) - rim)[~bright]))
+        if sag - max(rise, 0.0) > _SAG * step and grid.part.halo_px == 0.0:
             return False
     uneven, marked = (
         np.ptp(some.reshape(-1, *tone.shape), axis=0) > _FLAT * np.maximum(local, 0.25 * step)
@@ -219,7 +234,7 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
         return "corners off the grid"
     if not _turns_alike(grid.points):
         return "a folded grid"
-    if min(shape) >= 2 and not _squares_are_plain(grid):
+    if min(shape) >= 2 and not _squares_are_plain(grid, close):
         return "squares that are not plain"
     if min(shape) >= 2 and _edges_bulge(grid):
         return "round spots"
@@ -385,21 +400,29 @@ _FINDERS: tuple[Callable[[GrayImage, tuple[int, int]], tuple[bool, AnyArray | No
 """The classic finder, the one by sectors, and the same with an exhaustive search."""
 
 
+_EVEN_LIGHT = np.rint(255.0 * np.log1p(np.arange(256) / 4.0) / math.log1p(255 / 4.0)).astype(np.uint8)
+"""Logarithms of grey levels: in a shadow black and white are as far apart as beside it."""
+
+
 def _candidates(gray: GrayImage, columns: int, rows: int, quick: bool) -> Iterator[list[FloatArray]]:
     """Grids (r, c, 2) of the picture to try, stage by stage."""
-    fragments = False
+    some = fragments = False
     zooms = lattice_levels(gray)
     # Where the board moved, or white bleeds into black, corners are saddle points in a smaller copy only.
-    for zoom in (*zooms, 0.5 * zooms[0]):
-        if quick and zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS:
+    levels = [(zoom, False) for zoom in (*zooms, 0.5 * zooms[0])]
+    for zoom, even in (*levels, *((zoom, True) for zoom in zooms if zoom <= 1.0)):
+        if quick and (even or (zoom > 1.0 and zoom**2 * gray.size > _QUICK_PIXELS)):
             continue
-        level, grids = resized(gray, zoom), []
+        if even and not some:
+            break
+        level, grids = resized(_EVEN_LIGHT[gray] if even else gray, zoom), []
         for lattice in find_lattices(find_saddles(level.image), least=max(4, columns * rows // 4)):
             shape = sorted(lattice.points.shape[:2])
             points = complete(lattice) if shape == sorted((rows, columns)) else None
             if points is not None:
                 grids.append(level.to_picture(points))
             elif all(a <= b for a, b in zip(shape, sorted((rows, columns)), strict=True)):
+                some = True
                 fragments |= int(lattice.seen.sum()) >= _FRAGMENT * columns * rows
         yield grids
     if quick or not fragments or min(gray.shape) < _MIN_SIDE_PX:

@@ -780,7 +780,8 @@ _FAR = 0.2
 _UNKNOWN_SIGMA = 0.25
 """Sigma of a corner that was not refined, in squares."""
 _RESCUE_WINDOWS = (0.45, 0.28, 0.2)
-_SIGMAS = 6.0
+_SIGMAS, _UNSURE = 6.0, 8.0
+"""Distance from its prediction in standard deviations of a corner, these up to so many times the median."""
 _PASSES = 3
 _CLOSE_WINDOW = 0.28
 _DISTURBED = 1.5
@@ -1014,7 +1015,9 @@ def _checked(part: Part, fit: LocalFit, good: BoolArray) -> _Check | None:
     square = _sides_px(grid).ravel()
     away = np.linalg.norm(fit.points - placed, axis=1)
     far = _FAR * square
-    bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * fit.sigma_px), far)
+    # What lies over a corner makes it unsure, and is not to excuse how far off it is.
+    sigma_px = np.minimum(fit.sigma_px, _UNSURE * np.median(fit.sigma_px[good]))
+    bound = np.minimum(np.maximum(prediction.limit_px.ravel(), _SIGMAS * sigma_px), far)
     return _Check(prediction, placed, away, bound, far, grid)
 
 
