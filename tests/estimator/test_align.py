@@ -103,6 +103,24 @@ def test_a_camera_on_a_faster_clock_is_told(pace: float) -> None:
     assert abs(pace) < 0.01 or "% slower than the IMU's" in told[0].text
 
 
+def test_readings_renewed_by_the_sensors_own_clock_weigh_less_where_they_change() -> None:
+    """400 a second, 1 % fast, as of a BNO055: they are up to 2.5 ms old, by a beat as fast as the swing."""
+    trial = draw(1)
+    logs = [align_log(twin_log(trial.rig, *motion, 10 + k)) for k, motion in enumerate(MOTIONS)]
+    exact = align(logs, prior_settings(trial.view))
+    assert exact.noise.age_s == 0.0
+    for k, log in enumerate(logs):
+        renewed_s = np.floor(404.0 * log.imu_s) / 404.0
+        readings = [np.interp(renewed_s, log.imu_s, axis) for axis in log.readings.T]
+        logs[k] = replace(log, readings=np.stack(readings, axis=1))
+    found = align(logs, prior_settings(trial.view))
+    # 2.5 ms / sqrt(12) is 0.71 ms; what they are late in the mean is in the time offset.
+    assert 5e-4 < found.noise.age_s < 1e-3
+    assert found.noise.imu[2] < 1.2 * exact.noise.imu[2]
+    assert abs(found.sensor[OFFSET] - exact.sensor[OFFSET] + 1.24e-3) < 3e-4
+    assert np.abs(np.delete(scores(trial, found), OFFSET)).max() < 3.0
+
+
 def test_the_clocks_steps_are_in_the_offset() -> None:
     """A float32 after a day is averaged over; of a tick of the IMU's own period the phase is not known."""
     trial = known(SimulatedRig())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise, product
 
 import numpy as np
@@ -130,7 +130,7 @@ def imu_terms(off: FloatArray, noise: FloatArray) -> tuple[float, FloatArray, Fl
 
     Parameters
     ----------
-    noise : (3,) standard deviations.
+    noise : (n, 3) standard deviations.
     """
     known = np.isfinite(off)
     z = np.where(known, off, 0.0) / noise
@@ -180,14 +180,31 @@ class Stretch:
     start: FloatArray
     loose: FloatArray
 
+    @cached_property
+    def steep(self) -> FloatArray:
+        """Change (m, 3) of the readings in a second, 0 where one is missing."""
+        return np.nan_to_num(np.abs(np.gradient(self.readings, self.imu_s, axis=0)))
+
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the sensors: tracker's jitter [px], share of outliers, and (3,) of a_x, a_y, g_z."""
+    """Noise of the sensors.
+
+    Attributes
+    ----------
+    jitter_px, share : of the tracker, and the share of outliers.
+    imu : (3,) of a_x, a_y, g_z at rest.
+    age_s : of the times of readings: a sensor renews what is read by a clock of its own.
+    """
 
     jitter_px: float
     share: float
     imu: FloatArray
+    age_s: float = 0.0
+
+    def of(self, steep: FloatArray) -> FloatArray:
+        """Deviations (n, 3) of readings that change so much in a second."""
+        return np.asarray(np.hypot(self.imu, self.age_s * steep))
 
 
 @dataclass(frozen=True)
@@ -247,11 +264,13 @@ def _pictures(
         yield stretch.pixels[part] - rows.predicted, rows
 
 
-def _readings(stretch: Stretch, c: FloatArray, sensor: FloatArray) -> Iterator[tuple[FloatArray, Rows]]:
-    """Readings (k, 3) of the IMU minus predicted with their rows, a chunk at a time."""
+def _readings(
+    stretch: Stretch, c: FloatArray, sensor: FloatArray
+) -> Iterator[tuple[FloatArray, Rows, FloatArray]]:
+    """Readings (k, 3) of the IMU minus predicted with their rows and steepness, a chunk at a time."""
     for part in chunks(len(stretch.imu_s)):
         rows = imu_rows(stretch.knots, c, sensor, stretch.imu_s[part])
-        yield stretch.readings[part] - rows.predicted, rows
+        yield stretch.readings[part] - rows.predicted, rows, stretch.steep[part]
 
 
 def pictures_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
@@ -261,7 +280,7 @@ def pictures_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: Floa
 
 def readings_off(stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
     """Readings (m, 3) of the IMU minus predicted, NaN where one is missing."""
-    return np.concatenate([off for off, _ in _readings(stretch, c, sensor)])
+    return np.concatenate([off for off, _, _ in _readings(stretch, c, sensor)])
 
 
 def _picture_terms(
@@ -297,7 +316,7 @@ def _loss(problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise) -
     total = 0.5 * float((((s - problem.mean) / problem.sigma) ** 2).sum())
     for stretch, c in zip(problem.stretches, cs, strict=True):
         total += sum(_picture_terms(problem, noise, off)[0] for off, _ in _pictures(problem, stretch, c, s))
-        total += sum(imu_terms(off, noise.imu)[0] for off, _ in _readings(stretch, c, s))
+        total += sum(imu_terms(off, noise.of(steep))[0] for off, _, steep in _readings(stretch, c, s))
         total += _prior(stretch, c)[0]
     return total
 
@@ -320,8 +339,8 @@ def _normal(
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
             good.append(likely)
-        for off, rows in _readings(stretch, c, s):
-            _, pull, weight = imu_terms(off, noise.imu)
+        for off, rows, steep in _readings(stretch, c, s):
+            _, pull, weight = imu_terms(off, noise.of(steep))
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
         weight, pull = 1.0 / stretch.loose**2, _prior(stretch, c)[1]
@@ -714,7 +733,7 @@ def check_accelerometer(problem: Problem, source: str, sensor: FloatArray) -> No
     """
     power, straight, mirrored = 0.0, 0j, 0j
     for stretch in problem.stretches:
-        for off, rows in _readings(stretch, stretch.start, sensor):
+        for off, rows, _ in _readings(stretch, stretch.start, sensor):
             known = np.isfinite(off[:, 0] + off[:, 1])
             p, e = (values[known, 0] + 1j * values[known, 1] for values in (rows.predicted, off))
             r = p + e
@@ -801,8 +820,8 @@ class Fit:
 
 def _imu_noise(
     problem: Problem, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise
-) -> FloatArray:
-    """Deviations (3,) of the IMU's readings by their residuals and degrees of freedom."""
+) -> tuple[FloatArray, FloatArray]:
+    """Deviations (3,) of the IMU's readings by residuals and degrees of freedom, and counts over these."""
     rng, both = np.random.default_rng(0), np.array([-1, 1], dtype=np.int8)
     squares, count, taken = np.zeros(3), np.zeros(3), np.zeros(3)
     # One channel at a time: each probe takes the memory of all coefficients.
@@ -813,10 +832,11 @@ def _imu_noise(
         to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in signs], np.zeros((_PROBES, len(s)))
         for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
             done = 0
-            for off, rows in _readings(stretch, c, s):
-                _, pull, weight = imu_terms(off, noise.imu)
+            for off, rows, steep in _readings(stretch, c, s):
+                deviation = noise.of(steep)
+                _, pull, weight = imu_terms(off, deviation)
                 # Beyond `HUBER` deviations a reading counts as one there: a few wild ones are no noise.
-                squares[channel] += ((pull[:, channel] * noise.imu[channel]) ** 2).sum()
+                squares[channel] += ((pull[:, channel] * deviation[:, channel]) ** 2).sum()
                 count[channel] += (weight[:, channel] > 0.0).sum()
                 root = np.where(np.arange(3) == channel, np.sqrt(weight), 0.0)
                 for probe in range(_PROBES):
@@ -830,7 +850,28 @@ def _imu_noise(
     left = np.maximum(count - taken / _PROBES, 1.0)
     found = noise.imu * np.sqrt(squares / left)
     # Without readings of an axis its deviation plays no part.
-    return np.where(count > 20, np.maximum(found, 1e-6), noise.imu)
+    return np.where(count > 20, np.maximum(found, 1e-6), noise.imu), count / left
+
+
+_AGES_S = np.concatenate([[0.0], np.geomspace(5e-5, 3e-3, 42)])
+_AGE_GAIN = 10.0
+"""Loss that an age has to spare to be believed."""
+
+
+def _age_s(problem: Problem, cs: list[FloatArray], s: FloatArray, imu: FloatArray, lost: FloatArray) -> float:
+    """The likeliest deviation of the readings' times, by residuals of the gyroscope before the fit."""
+    off = np.concatenate(
+        [readings_off(one, c, s)[:, 2] for one, c in zip(problem.stretches, cs, strict=True)]
+    )
+    steep = np.concatenate([one.steep[:, 2] for one in problem.stretches])
+    known = np.isfinite(off)
+    squares, steep = lost[2] * off[known] ** 2, steep[known]
+    losses = np.empty(len(_AGES_S))
+    for k, age in enumerate(_AGES_S):
+        variance = imu[2] ** 2 + (age * steep) ** 2
+        losses[k] = 0.5 * float((np.log(variance) + np.minimum(squares / variance, HUBER**2)).sum())
+    best = int(np.argmin(losses))
+    return float(_AGES_S[best]) if losses[best] < losses[0] - _AGE_GAIN else 0.0
 
 
 def _renewed(
@@ -840,7 +881,8 @@ def _renewed(
     share = float(np.clip(1.0 - good.mean() if len(good) else 0.0, 1e-3, 0.5))
     offs = [pictures_off(problem, stretch, c, s) for stretch, c in zip(problem.stretches, cs, strict=True)]
     jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share, _OUTLIER_AREA_PX2)
-    return Noise(jitter, share, _imu_noise(problem, arrow, cs, s, noise))
+    imu, lost = _imu_noise(problem, arrow, cs, s, noise)
+    return Noise(jitter, share, imu, _age_s(problem, cs, s, imu, lost))
 
 
 def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
@@ -875,10 +917,11 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
             found = _renewed(problem, arrow, cs, s, noise, goods)
             change = np.abs(np.log(found.imu / noise.imu)).max()
             change = max(float(change), abs(np.log(found.jitter_px / noise.jitter_px)))
+            same_age = abs(found.age_s - noise.age_s) < 0.15 * max(found.age_s, _AGES_S[1])
             noise, same = found, 0
             del arrow
             arrow, to_cs, to_s, goods = _normal(problem, cs, s, noise)
-            converged = small and change < _SMALL_CHANGE
+            converged = small and change < _SMALL_CHANGE and same_age
             loss = _loss(problem, cs, s, noise)
     covariance = np.asarray(cho_solve(arrow.S, np.eye(len(s))))
     covariance = 0.5 * (covariance + covariance.T)
@@ -889,8 +932,8 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
     """Change (14,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
     stretch, c = problem.stretches[i], fit.coefficients[i]
     to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
-    for off, rows in _readings(stretch, c, fit.sensor):
-        _, _, weight = imu_terms(off, fit.noise.imu)
+    for off, rows, steep in _readings(stretch, c, fit.sensor):
+        _, _, weight = imu_terms(off, fit.noise.of(steep))
         gathered(rows.span, rows.basis, rows.by, -weight * change, to_c, to_s)
     return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.B[i].T @ fit.arrow.own(i, to_c)))
 
@@ -915,7 +958,7 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 #
 # what the accelerometer reads at phi = 0; it comes with its own deviation.
 
-_FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]))
+_FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]), 0.0)
 _AX, _AY, _MOUNT, _OFFSET, _MARKER = (
     SENSOR.index(name)
     for name in (
@@ -1224,8 +1267,8 @@ def _own(problem: Problem, fit: Fit, name: str, stretch: Stretch, c: FloatArray)
             # A place that no picture shows has no derivative.
             yield rows, np.where(weight > 0.0, rows.by[:, :, at], 0.0), pull, weight
         return
-    for off, rows in _readings(stretch, c, fit.sensor):
-        _, pull, weight = imu_terms(off, fit.noise.imu)
+    for off, rows, steep in _readings(stretch, c, fit.sensor):
+        _, pull, weight = imu_terms(off, fit.noise.of(steep))
         yield rows, rows.by[:, :, at], pull, weight
 
 
@@ -1238,7 +1281,9 @@ def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
         )
         change = (before.predicted - after.predicted) / (2.0 * _DIFFERENCE_S)
         change[:, 2] = 0.0
-        _, pull, weight = imu_terms(stretch.readings[part] - rows.predicted, fit.noise.imu)
+        _, pull, weight = imu_terms(
+            stretch.readings[part] - rows.predicted, fit.noise.of(stretch.steep[part])
+        )
         yield rows, change, pull, weight
 
 
