@@ -131,7 +131,7 @@ _MOST_PWM = 250
 
 _PULLED_RAD = (math.radians(12.0), math.radians(50.0))
 _STILL_RADPS, _LET_GO_RADPS = 0.15, 0.6
-_STILL_S, _BEFORE_S, _HAND_S = 0.8, 0.06, 60.0
+_STILL_S, _SLIP_S, _BEFORE_S, _HAND_S = 0.8, 0.05, 0.06, 60.0
 
 
 class Port(Protocol):
@@ -317,7 +317,7 @@ def _let_go(board: Board, tell: Callable[[str], None]) -> list[Message]:
     recent: deque[tuple[float, Message]] = deque()
     rest: list[tuple[float, float]] = []
     zero: float | None = None
-    still_s = told_s = -math.inf
+    moved_s = told_s = calm_s = -math.inf
     holds = False
     began = board.port.now_s()
     for message in board.messages():
@@ -345,14 +345,19 @@ def _let_go(board: Board, tell: Callable[[str], None]) -> list[Message]:
             return [one for _, one in recent]
         angle = abs(math.remainder(math.atan2(message.force[1], message.force[0]) - zero, 2.0 * math.pi))
         if spin > _STILL_RADPS or not _PULLED_RAD[0] <= angle <= _PULLED_RAD[1]:
-            still_s = now
+            if holds and now - calm_s < _SLIP_S:
+                # A head that is let go is slow for a sample as well.
+                continue
+            moved_s = now
             if holds:
                 tell("it moved slowly: hold it")
             holds = False
             if now - told_s > 2.0:
                 told_s = now
                 tell(f"  {math.degrees(angle):.0f} degrees")
-        elif not holds and now - max(still_s, began) > _STILL_S:
+            continue
+        calm_s = now
+        if not holds and now - max(moved_s, began) > _STILL_S:
             holds = True
             tell("let go")
     raise AssertionError("unreachable")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -20,9 +23,18 @@ from firmware_rigs import header
 
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.experiments import EXPERIMENTS, PROGRAMME, Board, Done, Experiment, experiment, perform
+from calib.io.experiments import (
+    EXPERIMENTS,
+    PROGRAMME,
+    Board,
+    Done,
+    Experiment,
+    _let_go,
+    experiment,
+    perform,
+)
 from calib.io.logs import read_log
-from calib.io.serial import ALIVE, CLEAR, GUARD_FAULT, GUARD_RUN, Decoder, Frame, setting
+from calib.io.serial import ALIVE, CLEAR, GUARD_FAULT, GUARD_RUN, Decoder, Frame, ImuSample, setting
 from calib.stages.firmware.header import header_of
 
 SILENT_MS = 284.0
@@ -217,6 +229,27 @@ def test_the_head_is_let_go_when_it_is_held_still_and_not_before(bare: Built, tm
     spin = np.abs(log.columns["gz_radps"])
     # The log begins just before the head does.
     assert 0.0 < log.t_s[np.nanargmax(spin > 0.5)] < 0.2 and done.seconds >= 5.0
+
+
+@pytest.mark.parametrize(("slow", "again"), [(1, 0), (20, 90)])
+def test_a_head_that_is_slow_for_a_sample_is_let_go(slow: int, again: int) -> None:
+    """One sample at the release is between still and gone; 0.2 s of them are a hand that slips."""
+    now_s, words = 0.0, []
+
+    def samples() -> Iterator[ImuSample]:
+        nonlocal now_s
+        for angle, rate, count in (
+            (0.0, 0.0, 60), (0.4, 0.0, 90), (0.4, 0.3, slow), (0.4, 0.0, again), (0.4, 1.0, 1),
+        ):  # fmt: skip
+            for _ in range(count):
+                now_s += 0.01
+                force = (9.8 * math.cos(angle), 9.8 * math.sin(angle), 0.0)
+                yield ImuSample(0, 0, force, (0.0, 0.0, rate))
+
+    board = SimpleNamespace(name="board", port=SimpleNamespace(now_s=lambda: now_s), messages=samples)
+    last = _let_go(cast("Board", board), words.append)[-1]
+    assert isinstance(last, ImuSample) and last.rate[2] == 1.0
+    assert ("it moved slowly: hold it" in words) == (again > 0)
 
 
 def _calib(*words: object, cwd: Path) -> str:
