@@ -18,8 +18,8 @@
  *                            or more than a fifth of them for long
  *   CALIB_FAULT_IMU_FROZEN   12 times the very same sample, or 72 times the same  by itself
  *                            rate or the same force
- *   CALIB_FAULT_CAMERA_LOST  the marker not seen for 15 ticks, or for two in     by itself
- *                            more than a fifth of them, where a mode needs it
+ *   CALIB_FAULT_CAMERA_LOST  the marker not seen for 15 ticks, or two ticks old  by itself
+ *                            in more than a fifth of them, where a mode needs it
  *   CALIB_FAULT_CAMERA_FROZEN the marker on one pixel while the angle turns      by itself
  *   CALIB_FAULT_APART        marker and angle of two places for half a second    by itself
  *   CALIB_FAULT_REACH        angle or lengths beyond the envelope for 6 ticks    by calib_guard_clear

@@ -87,7 +87,8 @@ class Board:
     Attributes
     ----------
     duty : what drives the pumps. time_s : since the start. states : (n, 10) of the plant at the pictures.
-    frame_hz : pictures a second by the camera's own oscillator.
+
+    The camera has `frame_hz` pictures a second by its own oscillator.
     """
 
     def __init__(self, built: Built, seconds: float = 200.0, seed: int = 1, frame_hz: float = 60.7) -> None:

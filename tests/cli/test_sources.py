@@ -67,6 +67,9 @@ def test_a_video_makes_the_camera_of_its_views(calib, video, project_root, tmp_p
     assert camera["rms_px"] < 1.1 * still["rms_px"]
     inputs = yaml.safe_load(rig.read_text())["provenance"]["inputs"]["camera"]
     assert list(inputs) == ["clip.avi"]
+    before = rig.read_bytes()
+    calib("intrinsics", video, *RADIAL2, "--rig", rig)
+    assert rig.read_bytes() == before
 
 
 def _bag(path: Path, views: list[np.ndarray], encoding: str, topics: tuple[str, ...] = ("/image",)) -> Path:

@@ -859,7 +859,12 @@ _AGE_GAIN = 10.0
 
 
 def _age_s(problem: Problem, cs: list[FloatArray], s: FloatArray, imu: FloatArray, lost: FloatArray) -> float:
-    """The likeliest deviation of the readings' times, by residuals of the gyroscope before the fit."""
+    """The likeliest deviation of the readings' times, by the gyroscope.
+
+    Parameters
+    ----------
+    lost : (3,) factors by which the fit has made the squares of residuals smaller.
+    """
     off = np.concatenate(
         [readings_off(one, c, s)[:, 2] for one, c in zip(problem.stretches, cs, strict=True)]
     )
@@ -958,7 +963,7 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 #
 # what the accelerometer reads at phi = 0; it comes with its own deviation.
 
-_FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]), 0.0)
+_FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]))
 _AX, _AY, _MOUNT, _OFFSET, _MARKER = (
     SENSOR.index(name)
     for name in (
