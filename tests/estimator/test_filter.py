@@ -13,6 +13,7 @@ from types import ModuleType
 import numpy as np
 import peers
 import pytest
+from drivenlogs import commands_of, driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth, truth_of_sensors
 from numba.core.dispatcher import Dispatcher
 from scipy.stats import truncnorm
@@ -26,7 +27,7 @@ from calib.stages.actuator.kinematics import forward as forward_of_sensors
 from calib.stages.camera.model import Camera
 from calib.stages.estimator import reference, sensors, smoother
 from calib.stages.estimator.consistency import Tally, chi_square_band, nees
-from calib.stages.estimator.driven import driven_event
+from calib.stages.estimator.driven import Drive, DrivenFilter, driven_event
 from calib.stages.estimator.event import CAMERA, IMU, REPORT, camera_terms, imu_terms
 from calib.stages.estimator.kinematic import (
     CONSIDERED,
@@ -838,6 +839,28 @@ def test_biases_walk_and_differ_from_log_to_log_as_was_measured_at_rest() -> Non
     without, _ = setup_from_rig(Rig.of({"align": aligned}, "rig.yaml"), Path("rig.yaml"), BLIND)
     assert without.process.sensor_walk == nominal
     assert without.start.covariance()[at, at] == pytest.approx(1e-10 + 1e-8, rel=1e-3)
+
+
+def test_readings_as_old_as_the_alignment_says_are_weighed_by_their_age() -> None:
+    """A BNO055 renews 400 readings a second by its own clock, so that they are up to 2.5 ms old."""
+    found = []
+    for age in ({}, {"imu_age_s": 7e-4}):
+        told, _ = setup_from_rig(Rig.of({"align": {**ALIGN, **age}}, "rig.yaml"), Path("rig.yaml"), BLIND)
+        figures = []
+        for seed in (1, 2, 3):
+            rig, log = driven_log("swing", seed)
+            rows, setup = rows_from(log), setup_for(rig, seed)
+            setup.noise[7] = told.noise[7]
+            readings, some = rows.readings.copy(), np.isfinite(rows.readings[:, 2])
+            renewed_s = np.floor(404.0 * rows.t_s[some]) / 404.0
+            for k in range(2, 5):
+                readings[some, k] = np.interp(renewed_s, rows.t_s[some], readings[some, k])
+            tally = Tally(setup.bellows_radius_m)
+            out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings), commands_of(log))
+            tally.add(out, truth(log))
+            figures.append([tally.rmse()[key] for key in ("mean_q_mm", "phi_deg", "nees")])
+        found.append(np.mean(figures, axis=0))
+    assert (found[1] < [0.75, 0.85, 0.6] * found[0]).all()
 
 
 def test_a_bias_that_walks_less_leaves_a_better_angle_at_rest() -> None:

@@ -79,6 +79,7 @@ class Align(Result):
         their combination is known.
     jitter_px, outlier_share, accel_noise_mps2, gyro_noise_radps : noise of single readings; the tracker's
         jitter before pixels are rounded.
+    imu_age_s : deviation of the times to which the IMU's readings belong; absent where none is seen.
     """
 
     time_offset_s: Seconds = quantity(label="time offset of pictures", show="ms", fact=True)
@@ -102,6 +103,9 @@ class Align(Result):
         label="accel noise", digits=4
     )
     gyro_noise_radps: Noise = quantity(label="gyro noise", digits=4)
+    imu_age_s: Annotated[float, Field(gt=0.0, le=0.1, allow_inf_nan=False, strict=True)] | None = quantity(
+        None, label="times of the IMU's readings", show="ms", digits=2
+    )
     logs: list[LogCheck] = quantity([], label="log")
 
     @field_validator("covariance")

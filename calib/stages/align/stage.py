@@ -110,6 +110,7 @@ def _solve(
         outlier_share=found.noise.share,
         accel_noise_mps2=found.noise.imu[:2].tolist(),
         gyro_noise_radps=float(found.noise.imu[2]),
+        imu_age_s=found.noise.age_s or None,
         logs=list(found.logs),
         **judged(verdict),
     ).with_evidence(found)

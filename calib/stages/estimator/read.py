@@ -417,6 +417,7 @@ def _noise(rig: Rig, found: Periods) -> FloatArray:
         numbers["gyro_radps"] = rig.align.gyro_noise_radps or numbers["gyro_radps"]
         for key, value in zip(("accel_x_mps2", "accel_y_mps2"), rig.align.accel_noise_mps2, strict=True):
             numbers[key] = value or numbers[key]
+        numbers["imu_stamp_s"] = math.hypot(numbers["imu_stamp_s"], rig.align.imu_age_s or 0.0)
     if rig.estimator is not None:
         numbers["jitter_px"] = rig.estimator.jitter_px
         if rig.estimator.accel_noise_mps2 is not None:
