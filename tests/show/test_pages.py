@@ -327,7 +327,11 @@ def test_without_a_plane_logs_cannot_be_flashed_and_pictures_alone_can() -> None
     pictures = decide(told | {"logs": []}, camera)
     assert (pictures.answer, pictures.exit_code) == ("yes", 0)
     both = decide(_whole(control="skipped") | {"logs": []}, camera | {"plane": {"verdict": "ok"}})
-    assert (both.answer, "drives no pumps" in both.headline) == ("yes", True)
+    assert (both.answer, "only with CALIB_I_KNOW" in both.headline) == ("yes", True)
+    states = decide(_whole(control="skipped") | {"logs": ["swing.csv"]}, SECTIONS)
+    assert (states.answer, "only with CALIB_I_KNOW" in states.headline) == ("yes", True)
+    whole = decide(_whole() | {"logs": ["swing.csv"]}, {**SECTIONS, "controller": {"verdict": "ok"}})
+    assert (whole.answer, "CALIB_I_KNOW" in whole.headline) == ("yes", False)
 
 
 def test_what_is_lacking_comes_before_what_is_poor_for_want_of_it() -> None:
