@@ -243,6 +243,7 @@ class Passed:
     sorted : rows that stood below a later one, and were put where they belong.
     twice : rows that say what the one before says, at its time, and were left out.
     said : lines of words alone between the rows, as a board prints them.
+    damaged : lines that are no row, few among many. damage : what is wrong with the first of them.
     """
 
     not_finite: int = 0
@@ -256,6 +257,8 @@ class Passed:
     sorted: int = 0
     twice: int = 0
     said: int = 0
+    damaged: int = 0
+    damage: str = ""
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -270,6 +273,8 @@ class Passed:
             self.sorted + later.sorted,
             self.twice + later.twice,
             self.said + later.said,
+            self.damaged + later.damaged,
+            self.damage or later.damage,
         )
 
     @property
@@ -289,6 +294,7 @@ class Passed:
             (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
             (self.twice, f"{self.twice} rows are written twice; left out"),
             (self.said, f"{self.said} lines between the rows hold words and no number; passed over"),
+            (self.damaged, f"{self.damaged} lines came damaged and are left out, the first {self.damage}"),
         )
         return [sentence for there, sentence in kinds if there]
 

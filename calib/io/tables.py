@@ -64,7 +64,8 @@ def _number(text: _Text, word: str, column: str, line: int) -> float:
     if word in _BLANK:
         return math.nan
     date = text.dates and column == "t_s"
-    value = _date_s(word) if date else plain_number(word.replace(",", ".") if text.decimal == "," else word)
+    plain = word.replace("\N{MINUS SIGN}", "-")
+    value = _date_s(word) if date else plain_number(plain.replace(",", ".") if text.decimal == "," else plain)
     if value is None:
         expected = _DATE if date else "a number" + f", or in all rows {_DATE}" * (column == "t_s")
         raise BadInputError(
@@ -73,9 +74,10 @@ def _number(text: _Text, word: str, column: str, line: int) -> float:
     return value if math.isfinite(value) else math.inf
 
 
-_BLANK = ("", "NA", "N/A", "null", "NULL", "None")
-"""Cells of a sensor that was not sampled, as R, pandas, JavaScript and Python write them."""
+_BLANK = ("", "NA", "N/A", "null", "NULL", "None", "-", "--")
+"""Cells of a sensor that was not sampled, as R, pandas, JavaScript, Python and people write them."""
 _DATE = "a date such as 2024-05-01T12:00:00.25"
+_DAY_FIRST = re.compile(r"\A(\d\d)\.(\d\d)\.(\d{4}) +")
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,:]\d+)?)")
 
 
@@ -87,7 +89,7 @@ def _date_s(word: str) -> float | None:
         hours, minutes, seconds = of_day.groups()
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(re.sub("[,:]", ".", seconds))
     try:
-        date = datetime.fromisoformat(word)
+        date = datetime.fromisoformat(_DAY_FIRST.sub(r"\3-\2-\1T", word))
     except ValueError:
         return None
     since = (date if date.tzinfo else date.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
@@ -202,27 +204,48 @@ def _floats(column: Any) -> FloatArray:
 
 
 def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
-    """The rows line by line, with a sentence for what cannot be read; what a board says between is no row."""
+    """The rows line by line; what a board says between is no row, nor is one in `_SOUND` that is damaged.
+
+    Raises `BadInputError` with a sentence for what cannot be read.
+    """
     values = np.empty((len(lines), len(text.slots)))
-    count, said = len(text.columns.names), np.zeros(len(lines), dtype=np.bool_)
+    passed, taken = Passed(), np.ones(len(lines), dtype=np.bool_)
+    first: BadInputError | None = None
+    spared = max(len(lines) // _SOUND, int(len(lines) > 0 and lines[0] > _SOUND))
     for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
-        where, words = f"{text.source}, line {line}", raw.decode("utf-8", "replace").rstrip("\r")
-        said[row] = _is_said(text, words)
-        if said[row]:
+        words = raw.decode("utf-8", "replace").rstrip("\r")
+        if _is_said(text, words):
+            taken[row], passed = False, passed + Passed(said=1)
             continue
-        cells = _split(where, words, text.separator)
-        if len(cells) != count:
-            raise BadInputError(
-                f"{where}: has {len(cells)} cells, expected {count} as in the header; take out a line that "
-                "came damaged"
-            )
-        for k, (name, slot) in enumerate(text.slots.items()):
-            values[row, k] = _number(text, cells[slot], name, line)
-    values, lines = values[~said], lines[~said]
+        try:
+            values[row] = _row(text, words, line)
+        except BadInputError as error:
+            first = first or error
+            taken[row], passed = False, passed + Passed(damaged=1)
+            if passed.damaged > spared:
+                raise first from None
+    values, lines = values[taken], lines[taken]
     infinite = np.isinf(values)
     values[infinite] = np.nan
     cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
-    return Block(cells_of, lines, Passed(int(infinite.sum()), said=int(said.sum())))
+    damage = str(first).removeprefix(f"{text.source}, ").partition(";")[0] if first else ""
+    return Block(cells_of, lines, passed + Passed(int(infinite.sum()), damage=damage))
+
+
+_SOUND = 200
+"""One row in so many may be damaged, as a serial line damages them."""
+
+
+def _row(text: _Text, words: str, line: int) -> list[float]:
+    """The numbers of a line. Raises `BadInputError`."""
+    where, count = f"{text.source}, line {line}", len(text.columns.names)
+    cells = _split(where, words, text.separator)
+    if len(cells) != count:
+        raise BadInputError(
+            f"{where}: has {len(cells)} cells, expected {count} as in the header; take out a line that came "
+            "damaged"
+        )
+    return [_number(text, cells[slot], name, line) for name, slot in text.slots.items()]
 
 
 def _is_said(text: _Text, line: str) -> bool:

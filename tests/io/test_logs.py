@@ -138,6 +138,28 @@ def test_one_sentence_for_what_is_wrong(write, text: str | bytes, words: str) ->
     assert "\n" not in str(found.value)
 
 
+def test_few_damaged_lines_are_left_out_and_told_and_many_refuse_the_log(write) -> None:
+    rows = [f"{k / 100:.2f},{k % 7}.5" for k in range(1000)]
+    damaged = rows.copy()
+    damaged[40], damaged[300], damaged[999] = "0.40,1.5,2.5", "3.0", "9.99,4.\x005"
+    log = read_log(write("\n".join(["t_s,gz_radps", *damaged, ""])))
+    assert len(log) == 997 and not set(log.lines) & {42, 302, 1001}
+    assert log.passed.sentences == [
+        "3 lines came damaged and are left out, the first line 42: has 3 cells, expected 2 as in the header"
+    ]
+    for k in range(500, 503):
+        damaged[k] = "5"
+    with pytest.raises(BadInputError, match="line 42: has 3 cells"):
+        read_log(write("\n".join(["t_s,gz_radps", *damaged, ""])))
+
+
+def test_numbers_and_dates_as_people_write_them(write) -> None:
+    rows = ["24.10.2026 13:45:07.25,\N{MINUS SIGN}0.5,-", "24.10.2026 13:45:08,2,--"]
+    log = read_log(write("\n".join(["timestamp,gz_radps,ax_mps2", *rows, ""])))
+    assert log.t_s[1] - log.t_s[0] == pytest.approx(0.75)
+    assert log.columns["gz_radps"].tolist() == [-0.5, 2.0] and np.isnan(log.columns["ax_mps2"]).all()
+
+
 def test_a_line_without_an_end_is_not_read_into_memory(write, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "_BLOCK_BYTES", 1000)
     with pytest.raises(BadInputError, match="line 3: does not end"):
@@ -437,7 +459,7 @@ def test_times_may_be_dates(write, form: str, mark: str, zone: str) -> None:
     path.write_text(path.read_text().replace(f"{mark}7\n", f'{mark}"7 "\n'))
     assert np.array_equal(read_log(path).t_s, log.t_s)
     with pytest.raises(BadInputError, match=r"line 502: t_s is '1', expected a date such as"):
-        read_log(write(path.read_text() + f"1{mark}1\n"))
+        read_log(write(path.read_text() + 3 * f"1{mark}1\n"))
     with pytest.raises(BadInputError, match=r"line 3: t_s is '2024.*a number, or in all rows a date"):
         read_log(write(f"t_s{mark}u_px\n1{mark}1\n{dates[0]}{mark}1\n"))
 
