@@ -9,12 +9,15 @@ from typing import Annotated, Any
 import typer
 
 from calib.cli.common import JsonOption, RigOption, answer, check_log_name, narrate
+from calib.cli.verbs import of_logs
 from calib.core.command import note_inputs
 from calib.core.errors import UsageError
 from calib.core.files import shown
+from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.writing import check_writable
 
 
+@of_logs
 def join(
     camera: Annotated[Path, typer.Argument(help="Log with the marker, as calib track writes it.")],
     board: Annotated[Path, typer.Argument(help="Log with the IMU, and what else a board records.")],
@@ -27,6 +30,7 @@ def join(
         ),
     ] = None,
     same_clock: Annotated[bool, typer.Option("--same-clock", help="--offset 0.")] = False,
+    stated: LogOptions = NOTHING_STATED,
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
@@ -46,12 +50,18 @@ def join(
     if offset is not None and not math.isfinite(offset):
         raise UsageError(f"--offset: is {offset}, expected seconds")
     check_log_name(output)
-    note_inputs([camera, board, *beside(camera), *beside(board)])
+    files = [stated.columns, stated.topics]
+    note_inputs(
+        [camera, board, *beside(camera), *beside(board), *(path for path in files if path is not None)]
+    )
     check_writable(output, LOG)
     known = Rig.load(rig, missing_ok=True)
     given = 0.0 if same_clock else offset
-    marker = read_log(camera, picture_px=known.picture_px)
-    log, clocks, outside = joined(marker, read_log(board), known, shown(rig), given)
+    remarks: list[str] = []
+    marker = read_log(camera, stated, remarks, known.picture_px)
+    log, clocks, outside = joined(marker, read_log(board, stated, remarks), known, shown(rig), given)
+    for remark in remarks:
+        narrate(remark)
     write_log(output, log)
     told: dict[str, Any] = {"log": shown(output), "rows": len(log), "outside": outside}
     lines = [f"{len(log)} rows written to {shown(output)}: t_s, {', '.join(log.columns)}"]

@@ -341,15 +341,16 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     )
     (tmp_path / "TotalAcceleration.csv").write_text(text)
     (tmp_path / "Gyroscope.csv").write_text(text.replace("9.8", "0.1"))
-    (tmp_path / "columns.yaml").write_text("units: {gyro: rad/s}\n")
     phone = ("join", "TotalAcceleration.csv", "Gyroscope.csv", "--same-clock", "-o", "phone.csv")
     ended = calib(*phone, cwd=tmp_path)
-    assert ended.code == 0, ended.err
+    assert ended.code == 3 and "give --gyro-unit" in ended.err
+    ended = calib(*phone, "--gyro-unit", "rad/s", cwd=tmp_path)
+    assert ended.code == 0 and "Gyroscope.csv: read as: time in s from" in ended.err, ended.err
     assert len(read_log(tmp_path / "phone.csv").sampled("ay_mps2")) == 30
     assert len(read_log(tmp_path / "phone.csv").sampled("gx_radps", "gy_radps", "gz_radps")) == 30
-    ended = calib("join", "Gyroscope.csv", "phone.csv", "--same-clock", "-o", "again.csv", cwd=tmp_path)
+    again = ("join", "Gyroscope.csv", "phone.csv", "--same-clock", "-o", "again.csv")
+    ended = calib(*again, "--gyro-unit", "rad/s", cwd=tmp_path)
     assert ended.code == 3 and "Gyroscope.csv: has no column that phone.csv has not" in ended.err
-    (tmp_path / "columns.yaml").unlink()
     rig_file(tmp_path / "rig.yaml")
     (tmp_path / "track.csv").write_text("t_s,u_px,v_px\n0.005,400,2\n0.02,401,4\n0.03,402,4\n")
     ended = calib(*words, "outside.csv", cwd=tmp_path)

@@ -320,7 +320,8 @@ def _of_log(log: StaticLog, axes: tuple[str, ...]) -> Iterator[Finding]:
     moved = log.moved_share > _MOVED_SHARE
     severity: Severity = "poor" if moved else "remark"
     for motion in log.motions[:_SHOWN_MOTIONS]:
-        text = f"{log.source}: moves from {motion.from_s:.1f} to {motion.to_s:.1f} s, seen most in "
+        from_s = round(motion.from_s, 1) + 0.0
+        text = f"{log.source}: moves from {from_s:.1f} to {motion.to_s:.1f} s, seen most in "
         text += f"{axes[motion.axis]}; that stretch is left out"
         yield Finding(severity, text, _AGAIN if moved else "")
     more = len(log.motions) - _SHOWN_MOTIONS
