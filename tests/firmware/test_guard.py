@@ -261,6 +261,18 @@ def test_the_self_test_passes_in_any_envelope(tmp_path: Path, envelope: dict[str
     assert subprocess.run([tmp_path / "guard"], check=False).returncode == 0
 
 
+def test_a_slow_pump_may_fill_its_bellows_at_full_power() -> None:
+    def full_s(sections: dict[str, dict[str, object]]) -> float:
+        made = header_of(Rig.of(sections, "rig.yaml"), "rig.yaml").values
+        return made["CALIB_ENVELOPE_FULL_TICKS"] / made["CALIB_TICK_RATE_HZ"]
+
+    slow, fast = ({"pump": {"verdict": "ok", "lag_s": lag_s}} for lag_s in (2.0, 0.7))
+    assert (full_s({"envelope": {}}), full_s(fast)) == (3.0, 3.0)
+    # Four lags: the force is 2 % from where it settles.
+    assert full_s(slow) == 8.0
+    assert full_s({**slow, "envelope": {"full_power_s": 1.0}}) == 1.0
+
+
 def test_a_log_knows_every_fault_of_the_guard() -> None:
     names = re.findall(r"#define CALIB_FAULT_(\w+) (\d+)", verbatim("calib_guard.h"))
     numbers = {int(number) for name, number in names if name not in ("NONE", "STAYS")}

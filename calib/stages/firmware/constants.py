@@ -344,6 +344,8 @@ def _limits(lookup: Lookup) -> tuple[float, float]:
 
 _SHORTEST_M, _LONGEST_M = 0.5 * LONGEST_ELONGATION_M, 1.25 * LONGEST_ELONGATION_M
 """By how much a bellows may be shorter and longer than at rest."""
+_FILLED_LAGS = 4.0
+"""Lags of the pump after which its force is 2 % from where it settles."""
 
 
 def _envelope(
@@ -367,16 +369,19 @@ def _envelope(
     reached = feed["first_m"] + _TABLE_STEP_M * np.arange(len(feed["pwm"]))
     held = float(np.interp(greatest, reached, feed["pwm"], right=PWM_MAX))
 
-    def ticks(name: str) -> int:
+    def ticks(name: str, least_s: float = 0.0) -> int:
         # The guard's self-test needs three.
-        return min(max(round(limit(name) * rate_hz), 3), 65000)
+        time_s = limit(name, max(float(getattr(Envelope(), name)), least_s))
+        return min(max(round(time_s * rate_hz), 3), 65000)
+
+    lag_s = lookup.find("pump.lag_s") or 0.0
 
     return {
         "least_length_m": least,
         "greatest_length_m": greatest,
         "angle_rad": limit("angle_rad", min(_LONGEST_M / (2.0 * radius), 1.5)),
         "rate_mps": limit("rate_mps"),
-        "full_ticks": ticks("full_power_s"),
+        "full_ticks": ticks("full_power_s", _FILLED_LAGS * lag_s),
         "open_ticks": ticks("open_loop_s"),
         "open_loop_pwm": float(math.floor(limit("open_loop_pwm", held, *pwm))),
         "apart_m": limit("apart_m"),

@@ -25,7 +25,7 @@ class Envelope(Section):
     """Rate of a length."""
 
     full_power_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, strict=True)] = 3.0
-    """Time that a pump may stay at its greatest command."""
+    """Time that a pump may stay at its greatest command. Default: 3, or four lags of a slower pump."""
 
     open_loop_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, strict=True)] = 60.0
     """Time that a pump may be on in open loop, less four times what it was off."""
