@@ -387,3 +387,26 @@ def test_a_bad_picture_among_good_ones(name: str, request: pytest.FixtureRequest
     serious = [one for one in faults if "not named" not in one]
     assert serious == []
     assert len(faults) <= 3
+
+
+def test_two_views_of_another_crop_leave_and_are_no_second_camera_with_a_third() -> None:
+    rng, camera = np.random.default_rng(1), camera_of()
+    views = take(rng, camera, 10, recipe=Recipe(0.02, tilt_deg=(15.0, 45.0)))
+    views = [replace(one, pixels=one.pixels - 30.0 * (i in (2, 5))) for i, one in enumerate(views)]
+    found = calibrate_camera(views, SIZE, Choices("radial2"))
+    assert _views_left(found) == {"v02", "v05"}
+    assert found.verdict.word == "ok"
+    assert found.calibration.rms_px < 0.04
+
+
+@pytest.mark.parametrize(("moved_px", "word"), [(6.0, "poor"), (0.0, "ok")])
+def test_a_board_that_moves_before_a_rolling_shutter_is_said(moved_px: float, word: str) -> None:
+    """Up to so many pixels from the picture's first row to its last: fx is 2 % off."""
+    rng, camera = np.random.default_rng(5), camera_of()
+    views = take(rng, camera, 10, recipe=Recipe(0.02, tilt_deg=(15.0, 45.0)))
+    for i, one in enumerate(views):
+        moved = moved_px * rng.uniform(-1.0, 1.0, 2) * (one.pixels[:, 1:] / SIZE[1] - 0.5)
+        views[i] = replace(one, pixels=one.pixels + moved)
+    found = calibrate_camera(views, SIZE, Choices("radial2")).verdict
+    assert found.word == word
+    assert any("changes from picture to picture" in one for one in found.reasons) == (moved_px > 0.0)

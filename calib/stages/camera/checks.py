@@ -468,6 +468,27 @@ def overdispersion(found: Evidence) -> float:
     return float(np.sqrt(max(ratio, 1.0)))
 
 
+_TOLD = 1e-3
+"""What a view tells of a direction, over what all views do, below which it is silent there."""
+
+
+def alone_px(calibration: Calibration) -> float:
+    """Standard deviation of a coordinate if every view had a camera of its own, its skew included.
+
+    One step of each view's parameters, in the directions of which it tells anything.
+    """
+    free = np.union1d(calibration.free, [INTRINSICS.index("skew_px")])
+    found = evidence(replace(calibration, free=free))
+    values, vectors = np.linalg.eigh(scaled_inverse(found.S.sum(axis=0)))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    told, Q = np.linalg.eigh(root.T @ found.S @ root)
+    y2 = np.einsum("ngk,ng->nk", root @ Q, found.b) ** 2
+    counts = told > _TOLD
+    fall = float((y2[counts] / told[counts]).sum())
+    freedom = int(found.measured.sum()) - 6 * len(found.b) - int(counts.sum())
+    return math.sqrt(max(float(found.cost.sum()) - fall, 0.0) / max(freedom, 1))
+
+
 # ----------------------------------------------------------------------
 # Is the target what it is said to be: flat, its squares square?
 #

@@ -29,6 +29,7 @@ from calib.stages.camera.bundle import (
 from calib.stages.camera.checks import (
     FAULTS,
     TargetShape,
+    alone_px,
     apart_px,
     best_of_starts,
     drift,
@@ -57,6 +58,7 @@ from calib.stages.camera.model import (
 from calib.stages.camera.options import BY_DEFAULT, Choices
 from calib.stages.camera.triage import Triage, triage, turned_views
 from calib.stages.camera.verdict import (
+    Limits,
     judge,
     of_copies,
     of_faults,
@@ -422,6 +424,8 @@ _HOPELESS = 0.02
 _ROUGH = "radial2"
 _TRIAGES = 3
 """Times that a model is chosen; bad views can make the first choice wrong."""
+_FEW_ODD = 2
+"""Most views that are no second camera."""
 _FAR_BETTER = 0.5
 """Squared error of a typical view over that by the chosen model."""
 
@@ -563,8 +567,8 @@ def calibrate_camera(
     leaving = [*left_out, *unusable, *odd]
     agree = sorted_out.calibration.observations.views
     moved_px = _moved_px(replace(sorted_out, everything=of_all))
-    findings = list(of_leaving(leaving, agree, choices.keep_all, moved_px))
-    if sorted_out.left_out:
+    findings, shared = list(of_leaving(leaving, agree, choices.keep_all, moved_px)), list[Finding]()
+    if sorted_out.left_out and not _alone_odd(sorted_out):
         several = two_cameras(sorted_out.everything)
         if any(one.severity == "inconsistent" for one in findings):
             findings += several
@@ -576,6 +580,7 @@ def calibrate_camera(
             sorted_out = Triage.of_all(fit)
             leaving = [*left_out, *unusable, *turned]
             findings = list(of_leaving(leaving, everything.views, choices.keep_all))
+            shared = several
     not_used = [*left_out, *unusable] if choices.keep_all else leaving
     fit = sorted_out.calibration
     if choices.keep_all:
@@ -593,6 +598,8 @@ def calibrate_camera(
     covered = time.perf_counter()
     findings += of_copies(copies)
     verdict = _judged(fit, findings)
+    if shared and verdict.word in ("ok", "poor"):
+        verdict = _judged(fit, [*findings, *shared])
     if verdict.word == "unidentifiable" and (better := best_of_starts(fit)) is not fit:
         fit, sigma = better, _by_the_views(better)
         verdict = _judged(fit, findings)
@@ -660,6 +667,15 @@ def _screened(fit: Calibration) -> Triage:
         rigid = refitted(replace(fit, observations=everything), kept, observations=seen)
         found, gone = Triage(rigid, fit, other.left_out, other.scale_px), leaving
     return found
+
+
+def _alone_odd(found: Triage) -> bool:
+    """Whether one or two views leave and the others agree as well as views of one camera do.
+
+    Where those few differ by much, views that agree may seem to share a second camera with them.
+    """
+    views, rest = sum(one.kind == "view" for one in found.left_out), found.calibration
+    return views <= _FEW_ODD and rest.sigma_px < Limits.change_times * alone_px(_on_its_board(rest))
 
 
 def _moved_px(found: Triage) -> float:

@@ -38,6 +38,7 @@ from calib.stages.camera.checks import (
     ONE_TO_ONE_REACH,
     Split,
     TargetShape,
+    alone_px,
     best_next_view,
     best_split,
     conditioned,
@@ -82,6 +83,9 @@ class Limits:
         outlier; share of outliers.
     heavy_remark : share of the squared residuals that the worst percent of points may hold.
     repeated_remark : error that repeats at the same points over what independent errors leave.
+    change_times, change_poor_px, change_remark_px : RMS over what it would be if each view had a camera of
+        its own, and the part of it that this would take away, px at up to 1000 pixels' width. Public sets
+        reach 1.2 times, a board that moves before a rolling shutter 2 to 3.
     decrement : standard deviations that the solver may stop short of a minimum.
     split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
         what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
@@ -127,6 +131,9 @@ class Limits:
     points_poor = 0.01
     heavy_remark = 0.2
     repeated_remark = 1.6
+    change_times = 1.5
+    change_poor_px = 0.1
+    change_remark_px = 0.03
     decrement = 2.0
     split_ratio = 1.5
     change_ratio = 1.3
@@ -587,6 +594,28 @@ def _repeated(calibration: Calibration) -> float:
     return float(np.sqrt((mean**2 * count[:, None]).mean() / spread)) if spread > 0.0 else 1.0
 
 
+def _of_change(fit: Calibration) -> Iterator[Finding]:
+    """One camera and one board in all views, not another in each."""
+    alone = float(np.sqrt(2)) * alone_px(fit)
+    change = float(np.sqrt(max(2 * fit.sigma_px**2 - alone**2, 0.0)))
+    scale = scale_of(fit.camera.image_size_px)
+    together = float(np.hypot(alone, change))
+    if together < Limits.change_times * alone or change < Limits.change_remark_px * scale:
+        return
+    most = Limits.change_poor_px * scale
+    text = (
+        f"The camera or the board changes from picture to picture: each would fit to {alone:.2g} px with a "
+        f"camera of its own, all together fit to {together:.2g} px (up to {most:.2g} px of change is good). "
+        "A board that moves before a rolling shutter, a sheet that bends, autofocus and image stabilisation "
+        "do so."
+    )
+    advice = (
+        "Put the camera and the board down for each picture, on a flat plate, with focus and zoom locked and "
+        "stabilisation off."
+    )
+    yield Finding("poor" if change > most else "remark", text, advice if change > most else "")
+
+
 _SEPARATELY = "Calibrate the two groups separately, with focus and zoom locked."
 
 
@@ -755,7 +784,12 @@ def _by_the_rules(calibration: Calibration) -> tuple[list[Finding], Calibration 
     findings += [*_of_richer(some, wide), *_of_target(shape, wide)]
     if shape is not None:
         wide = straightened(wide, shape.displacement_m)
-    findings += [*_of_split(best_split(wide), wide), *_of_border(fit, sturdy), *_of_lens(fit)]
+    findings += [
+        *_of_split(best_split(wide), wide),
+        *_of_change(wide),
+        *_of_border(fit, sturdy),
+        *_of_lens(fit),
+    ]
     return findings, sturdy
 
 
