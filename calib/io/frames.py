@@ -15,7 +15,7 @@ import numpy as np
 from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import check_readable, hash_of, is_bag, one_line, shown
-from calib.io.pictures import Picture, decoded_picture, eight_bits, of_one_field
+from calib.io.pictures import Picture, decoded_picture, eight_bits, fields_of
 
 # ----------------------------------------------------------------------
 # One pass over the frames. A stretch is a run of frames, of which the sharpest is kept; when there are too
@@ -72,8 +72,8 @@ def read_frames(path: Path, topic: str | None = None) -> Frames:
         raise BadInputError(f"{shown(path)}: holds no picture that can be decoded")
     digest = hash_of(path)
     pictures = tuple(
-        Picture(f"{name} frame {number:05d}", digest, gray, (gray.shape[1], gray.shape[0]))
-        for number, gray in kept
+        Picture(f"{name} frame {number:05d}", digest, gray, (gray.shape[1], gray.shape[0]), second=second)
+        for number, (gray, second) in ((number, fields_of(frame)) for number, frame in kept)
     )
     return Frames(name, digest, count, pictures)
 
@@ -92,7 +92,7 @@ def _sharpest(stream: Iterable[GrayImage]) -> tuple[list[tuple[int, GrayImage]],
     for number, gray in enumerate(stream):
         count += 1
         most = 2 * max(_FEWEST_STRETCHES, min(_STRETCHES, _KEPT_PIXELS // (2 * gray.size)))
-        one = _Best(number, _sharpness(gray), gray)
+        one = _Best(number, _sharpness(fields_of(gray)[0]), gray)
         if number // length < len(stretches):
             stretches[-1] = _sharper(stretches[-1], one)
         else:
@@ -122,7 +122,7 @@ def _sharpness(gray: GrayImage) -> float:
 def _of_video(path: Path) -> Iterator[GrayImage]:
     for frame in timed_frames(path)[1]:
         gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        yield of_one_field(np.asarray(gray, dtype=np.uint8))
+        yield np.asarray(gray, dtype=np.uint8)
 
 
 # ----------------------------------------------------------------------
@@ -319,4 +319,4 @@ def _of_message(message: Any, where: str) -> GrayImage:
     if code is None:
         return eight_bits(rows.view(kind).reshape(height, width))
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows.reshape(height, width)
-    return of_one_field(np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8))
+    return np.asarray(cv2.cvtColor(pixels, code), dtype=np.uint8)

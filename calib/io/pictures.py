@@ -149,9 +149,11 @@ class Picture:
     ----------
     name : of the file, control characters escaped.
     sha256 : of the file.
-    gray : (height, width) grey values; (0, 0) of a picture whose header alone was read.
+    gray : (height, width) grey values, of an interlaced picture of its first field; (0, 0) of a picture whose
+        header alone was read.
     size_px : width and height.
     count : of pictures in the file, of which this is the first.
+    second : the same of the second field of an interlaced picture.
     """
 
     name: str
@@ -159,6 +161,7 @@ class Picture:
     gray: GrayImage
     size_px: tuple[int, int]
     count: int = 1
+    second: GrayImage | None = None
 
 
 def _natural(path: Path) -> tuple[object, ...]:
@@ -273,7 +276,8 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     if decoded is None or decoded.size == 0:
         raise BadInputError(f"{where}: is not a picture that can be decoded")
     height, width = decoded.shape[:2]
-    return Picture(name, digest, eight_bits(decoded), (width, height), count_pictures(data))
+    gray, second = fields_of(eight_bits(decoded))
+    return Picture(name, digest, gray, (width, height), count_pictures(data), second)
 
 
 def is_heic(data: bytes) -> bool:
@@ -321,12 +325,9 @@ def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
 
 
 def eight_bits(decoded: AnyArray) -> GrayImage:
-    """Grey values of any depth as 8 bits, the brightest 0.1 % white.
-
-    Of a raw picture without its mosaic, of an interlaced one of its first field.
-    """
+    """Grey values of any depth as 8 bits, the brightest 0.1 % white; of a raw picture without its mosaic."""
     if decoded.dtype == np.uint8:
-        return of_one_field(_without_mosaic(np.ascontiguousarray(decoded, dtype=np.uint8)))
+        return _without_mosaic(np.ascontiguousarray(decoded, dtype=np.uint8))
     values = decoded.astype(np.float32)
     finite = np.isfinite(values)
     if not finite.all():
@@ -338,7 +339,7 @@ def eight_bits(decoded: AnyArray) -> GrayImage:
     values -= np.float32(low)
     values *= np.float32(255.0 / (white - low))
     gray = np.clip(np.rint(values, out=values), 0, 255, out=values).astype(np.uint8)
-    return of_one_field(_without_mosaic(gray))
+    return _without_mosaic(gray)
 
 
 _MOSAIC = 0.08
@@ -383,8 +384,8 @@ _LEAST_SLOPE = 2.0
 """Grey values per pixel, RMS over a cell of the grid."""
 
 
-def of_one_field(gray: GrayImage) -> GrayImage:
-    """An interlaced picture with its odd rows interpolated between the even ones; any other as it is.
+def fields_of(gray: GrayImage) -> tuple[GrayImage, GrayImage | None]:
+    """The two fields of an interlaced picture, rows of the other interpolated; any other picture, alone.
 
     Odd rows of an interlaced picture are of another moment, in which the board stood d pixels beside: their
     light is off by -d times its slope m_x. Four rows tell m_x, and by (1, -3, 3, -1) / 8 half of what odd
@@ -393,7 +394,7 @@ def of_one_field(gray: GrayImage) -> GrayImage:
     height, width = gray.shape
     rows, columns = (n // cells * cells for n, cells in zip((height // 4, width), _GRID, strict=True))
     if min(rows, columns) == 0:
-        return gray
+        return gray, None
     every = 1 + rows * columns * 4 // _FIELD_PIXELS
     # Columns have neighbours, so rows are left out.
     quads = gray[: 4 * rows, :columns].reshape(_GRID[0], -1, 4, columns)[:, ::every].astype(np.float32)
@@ -407,12 +408,19 @@ def of_one_field(gray: GrayImage) -> GrayImage:
     sloping = squares > _LEAST_SLOPE**2 * (off.size / (_GRID[0] * _GRID[1]))
     moved = sloping & (both**2 > _SHARE * squares * offs) & (abs(both) > _MOVED_PX * squares)
     if max(np.count_nonzero(moved & (both > 0.0)), np.count_nonzero(moved & (both < 0.0))) < _FEWEST:
-        return gray
-    even = gray[::2].astype(np.float32)
-    around = np.pad(even, ((1, 2), (0, 0)), mode="edge")
-    between = (9.0 * (around[1:-2] + around[2:-1]) - around[:-3] - around[3:]) / 16.0
+        return gray, None
+    return _of_field(gray, 0), _of_field(gray, 1)
+
+
+def _of_field(gray: GrayImage, first: int) -> GrayImage:
+    """The rows from `first` on, every other, and those between interpolated."""
+    own = np.pad(gray[first::2].astype(np.float32), ((2, 3), (0, 0)), mode="edge")
     whole = gray.copy()
-    whole[1::2] = np.clip(np.rint(between[: height // 2]), 0, 255)
+    n, k = len(whole[1 - first :: 2]), 2 - first
+    between = (
+        9.0 * (own[k : k + n] + own[k + 1 : k + 1 + n]) - own[k - 1 : k - 1 + n] - own[k + 2 : k + 2 + n]
+    ) / 16.0
+    whole[1 - first :: 2] = np.clip(np.rint(between), 0, 255)
     return whole
 
 

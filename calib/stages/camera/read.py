@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from calib.core.arrays import FloatArray, GrayImage
+from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, CalibError, UsageError
 from calib.core.files import PICTURES, check_readable, hash_of, one_line, read_yaml_mapping, shown, to_be
 from calib.core.schema import validated
@@ -24,7 +24,7 @@ from calib.core.workers import Workers
 from calib.io.frames import Frames, is_recording, read_frames
 from calib.io.pictures import Picture, holds_pictures, list_pictures, read_picture, usual_size
 from calib.stages.camera.choice import most_informative
-from calib.stages.camera.corners import Detection, detect, find_size
+from calib.stages.camera.corners import Detection, between_fields, detect, find_size
 from calib.stages.camera.model import Board, LeftOut, View
 from calib.stages.camera.options import Told
 from calib.stages.camera.targets import (
@@ -248,11 +248,11 @@ class _Album:
     paths: Sequence[Path]
     pictures: Sequence[Picture]
 
-    def gray(self, i: int) -> GrayImage | LeftOut:
-        """Grey levels, or why a picture cannot be decoded."""
+    def picture(self, i: int) -> Picture | LeftOut:
+        """A picture with its pixels, or why it cannot be decoded."""
         one = self.pictures[i]
         if one.gray.size:
-            return one.gray
+            return one
         try:
             again = read_picture(self.paths[i])
         except BadInputError as error:
@@ -261,7 +261,7 @@ class _Album:
             raise BadInputError(f"{one.name}: has changed since the work began")
         if again.size_px != one.size_px:
             return LeftOut(one.name, "has another size than its header says", "unreadable")
-        return again.gray
+        return again
 
 
 _Job = tuple[Callable[..., Any], int | tuple[int, ...], tuple[Any, ...]]
@@ -271,11 +271,16 @@ _Job = tuple[Callable[..., Any], int | tuple[int, ...], tuple[Any, ...]]
 def _look(album: _Album, job: _Job) -> Any:
     """What is seen, or why the picture cannot be decoded; of several those are looked into that can be."""
     ask, which, more = job
-    grays = [album.gray(i) for i in ([which] if isinstance(which, int) else which)]
-    whole = [gray for gray in grays if not isinstance(gray, LeftOut)]
+    read = [album.picture(i) for i in ([which] if isinstance(which, int) else which)]
+    whole = [one for one in read if isinstance(one, Picture)]
     if not whole:
-        return grays[0]
-    return ask(whole[0] if isinstance(which, int) else whole, *more)
+        return read[0]
+    if not isinstance(which, int):
+        return ask([one.gray for one in whole], *more)
+    seen, second = ask(whole[0].gray, *more), whole[0].second
+    if second is not None and isinstance(seen, Detection):
+        return between_fields(seen, ask(second, *more))
+    return seen
 
 
 @dataclass
