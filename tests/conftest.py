@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what the inner loop runs."""
+    """Mark what the inner loop runs, and what the fast tier leaves out of many like cases."""
+    places: Counter[str] = Counter()
     for item in items:
+        if few := item.get_closest_marker("few"):
+            test = item.nodeid.partition("[")[0]
+            if places[test] not in (few.args or (0,)):
+                item.add_marker(pytest.mark.slow)
+            places[test] += 1
         if _is_smoke(item.path) and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.smoke)
 
@@ -80,4 +87,4 @@ def project_root() -> Path:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of real recordings; the test skips without it."""
-    return outside(Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data")))
+    return outside(Path(os.environ.get("CALIB_SHARED_DATA") or ROOT.parent / "shared" / "data"))

@@ -363,6 +363,7 @@ def test_a_log_of_another_plant_is_contradicted_and_one_that_tells_more_is_not(
         assert judge(found, uncertainty(found), colour_of(found), [blamed], []).word == "ok"
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize("ticks", [0, 1, 5, -5])
 def test_commands_of_one_pump_that_come_late_are_named(ticks: int) -> None:
     names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "lag_ratio", "falling_N_per_s")
@@ -405,6 +406,7 @@ def test_what_is_stated_is_held_against_the_logs(name: str, share: float) -> Non
     assert abs(value - truth) < max(5.0 * sigma, 0.2 * abs(share - 1.0) * truth)
 
 
+@pytest.mark.few(0, 1)
 @pytest.mark.parametrize("swapped", [(), (1,), (0, 1)])
 def test_pumps_that_are_swapped_are_named(swapped: tuple[int, ...]) -> None:
     names = ("stiffness_scale", "damping_scale_pumps_connected", "lag_s", "falling_N_per_s")
@@ -438,6 +440,7 @@ def test_pictures_late_in_one_log_alone_are_named(late_s: float) -> None:
         assert verdict.word == "ok"
 
 
+@pytest.mark.few(0, 3)
 @pytest.mark.parametrize(("which", "from_s"), [(0, 2.0), (1, 1.5), (1, 0.0), (None, 0.0)])
 def test_a_camera_that_moves_in_a_log_or_between_logs_is_named(which: int | None, from_s: float) -> None:
     tracks = [track("prbs"), replace(track("prbs", seed=1), name="other")]
@@ -510,7 +513,7 @@ def test_an_orifice_is_found_from_springs_that_the_limited_rate_has_bent() -> No
     """Under a limited rate the springs come out at .29 of the nominal, and the rate is not told."""
     known = Machine()
     true = replace(known, pump=replace(known.pump, deflation=Orifice(1.2, 0.001)))
-    tracks = [track("prbs", duration_s=20.0, nominal=true), track("free", nominal=true)]
+    tracks = [track("prbs", duration_s=8.0, nominal=true), track("free", nominal=true)]
     found = fit_tracks(known, tracks, either_law=True)
     assert "air leaves by an orifice" in found.law
     assert found.values["stiffness_scale"] == pytest.approx(1.0, abs=0.02)
@@ -545,6 +548,7 @@ def test_the_law_of_deflation_is_found(law: RateLimit | Orifice, seed: int, tmp_
     assert {*asdict(law)} & {*found.values}
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "play", [{}, {"play_pwm": 18.0}, pytest.param({"play_N": 0.14}, marks=pytest.mark.slow)]
 )
@@ -566,6 +570,7 @@ def test_a_play_is_found_where_there_is_one(play: dict[str, float], tmp_path: Pa
         assert abs(found.values[name] - truth[name]) < 3.5 * sigma[name], name
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("tick_s", [0.01, 1.0 / 30.0])
 def test_the_boards_tick_is_that_of_the_commands(tick_s: float, tmp_path: Path) -> None:
     known = rig_file(tmp_path / "rig.yaml")
@@ -835,6 +840,7 @@ def _started(one: Track, from_s: float = 0.0) -> object:
     return start_in_motion(t, head, one.hoses, PLANT, SIGMA[0])
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("seed", range(5))
 def test_swings_that_are_let_go_begin_at_rest_and_cut_ones_do_not(seed: int) -> None:
     one = track("free", phi_rad=0.2 + 0.1 * seed, seed=seed)

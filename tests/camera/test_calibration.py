@@ -467,6 +467,7 @@ def test_the_chosen_lens_is_nearly_the_best_for_real_pictures(name: str, shared_
     assert chosen.held_back_rms_px <= 1.2 * best
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("skew_px", [0.0, 1.0])
 @pytest.mark.parametrize("roll_deg", [5.0, pytest.param(180.0, marks=pytest.mark.slow)])
 def test_a_skew_is_chosen_where_the_views_show_one(skew_px: float, roll_deg: float) -> None:

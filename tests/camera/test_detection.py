@@ -45,6 +45,7 @@ def _picture(
     return image, corner_pixels(camera, printed, pose)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize(
     ("folder", "size", "rms_px"), [("opencv_left", (9, 6), 0.170), ("gloworm_qvga", (8, 6), 0.068)]
 )
@@ -118,6 +119,7 @@ VARIANTS: dict[str, Callable[[GrayImage], GrayImage]] = {
 }
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize(
     ("folder", "size", "variant"),
     [
@@ -152,6 +154,7 @@ def test_as_many_boards_as_the_best_of_opencvs_finders(
     assert sum(detect(gray, *size) is not None for gray in grays) >= max(theirs)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("camera", "most_px"), [(VGA, 0.02), (PIXY, 0.025)], ids=["640x480", "316x208"])
 def test_error_against_rendered_truth_is_below_opencvs(camera: Camera, most_px: float) -> None:
     board = Board(9, 6, 0.025)
@@ -185,6 +188,7 @@ def _error(detection: Detection | None, truth: FloatArray) -> FloatArray:
     return min((pixels - truth, pixels[::-1] - truth), key=lambda error: float(np.sum(error**2)))
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize(
     ("camera", "size", "roll_rad", "blur_px", "after"),
     [
@@ -215,6 +219,7 @@ def test_sharp_edges_are_placed_to_a_hundredth_of_a_pixel(
     assert np.max(np.abs(errors)) < 0.1
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("camera", "moved"),
     [(PIXY, np.eye(9)), (PIXY, np.eye(9)[::-1]), (VGA, np.eye(21))],
@@ -241,6 +246,7 @@ def test_boards_whose_white_bleeds_into_black_are_found() -> None:
         assert np.abs(_error(detection, truth)).max() < 0.1
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("lit", "share"),
     [
@@ -275,6 +281,7 @@ def test_the_light_at_the_other_corners_places_a_blurred_one(
     assert ours < share * rmse()
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("size", [(7, 5), (9, 6), (4, 4), (5, 4)])
 def test_indices_keep_their_corners_at_every_angle(size: tuple[int, int]) -> None:
     board = Board(*size, 0.02)
@@ -363,6 +370,7 @@ def _lit(gray: GrayImage, corners: FloatArray) -> GrayImage:
     return np.clip(gray + 255.0 * np.exp(-((away / (0.8 * side)) ** 4)), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("camera", [VGA, PIXY], ids=["640x480", "316x208"])
 def test_boards_in_uneven_light_are_found(camera: Camera) -> None:
     for seed in range(4):
@@ -531,6 +539,7 @@ def _spots(radius: float, square_px: float, blur_px: float, dark: bool, shape: s
     return picture if dark else 255 - picture
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("square_px", [8, pytest.param(11, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
 def test_grids_of_round_spots_are_no_boards(square_px: float, blur_px: float) -> None:
@@ -556,6 +565,7 @@ def _charuco(rng: np.random.Generator) -> np.ndarray:
     return _seen(board.generateImage((580, 420), marginSize=10), rng)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("share", [0.4, 0.5, 0.65])
 def test_boards_with_markers_are_not_read_as_plain_ones(share: float) -> None:
     """Markers of half the square's side begin at its quarters, smaller ones further in."""

@@ -205,6 +205,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.few(0, 4, 6, 8)
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_hundredth_of_a_pixel_everywhere(name: str) -> None:
     """Checked against the lens model itself: distorting the answer again gives the pixel back."""

@@ -229,6 +229,7 @@ def test_a_marker_that_comes_back_elsewhere_is_told() -> None:
     assert tracker.elsewhere == [9] and "at 0.90 s" in tracker.doubt(np.arange(10) / 10)
 
 
+@pytest.mark.few(1, 7, 10, 13)
 @pytest.mark.parametrize("covered", [4, 10, 40])
 @pytest.mark.parametrize(
     ("other", "lost"),

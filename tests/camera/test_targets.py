@@ -114,6 +114,7 @@ def _april_grid() -> Drawing:
     return Drawing(image, 8, 8)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize(
     ("drawing", "says"),
     [

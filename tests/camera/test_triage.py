@@ -136,6 +136,7 @@ def _turned(view: View, how: str) -> View:
     return replace(view, pixels=pixels[order])
 
 
+@pytest.mark.few(0, 3)
 @pytest.mark.parametrize(
     ("how", "count", "bad"),
     [

@@ -56,6 +56,7 @@ def _judged(views: list[View], size_px: tuple[int, int], model: str) -> tuple[Ca
     return fit, judge(fit)
 
 
+@pytest.mark.few(1, 4, 9, 11)
 @pytest.mark.parametrize("model", list(MODELS))
 @pytest.mark.parametrize("seed", [2, 10])
 def test_good_sets_are_blessed(model: str, seed: int) -> None:

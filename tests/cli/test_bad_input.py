@@ -60,6 +60,7 @@ DAMAGED: dict[str, tuple[Callable[[np.ndarray], bytes], str]] = {
 }
 
 
+@pytest.mark.few(1, 3, 7, 8)
 @pytest.mark.parametrize("name", DAMAGED)
 def test_a_damaged_picture_alone(calib, pictures, rig, gray, name: str) -> None:
     make, says = DAMAGED[name]

@@ -154,6 +154,7 @@ def test_a_corner_file(calib, table_text, points, tmp_path) -> None:
         assert says in ended.sentence
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("model", ["pinhole", "radial2", "rational8"])
 def test_points_that_belong_to_no_camera(calib, table_text, tmp_path, model: str) -> None:
     rng = np.random.default_rng(0)
@@ -264,6 +265,7 @@ def test_the_shipped_camera(calib, rig) -> None:
     assert json.loads(calib("distortion", "--rig", rig, "--json").out)["lens"] == whole["lens"]
 
 
+@pytest.mark.few(0, 3)
 @pytest.mark.parametrize("k1", ["-50.0", "1.0e+5", "1.0e+30", "-1.0"])
 def test_a_lens_that_cannot_be_undone(calib, rig, k1: str) -> None:
     camera = yaml.safe_load(rig.read_text())["camera"]

@@ -153,6 +153,7 @@ def test_stdout_that_is_full(environment, rig) -> None:
     assert done.stderr == "calib: /dev/full: cannot be written: No space left on device\n"
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-", "2>/dev/full"])
 def test_streams_that_are_closed_harm_nothing(environment, rig, closed: str) -> None:
     before = rig.read_bytes()

@@ -172,6 +172,7 @@ def test_states_go_through_pipes(calib, environment, place: Path) -> None:
     assert (done.returncode, done.stdout) == (141, wanted.split("\n", 1)[0] + "\n")
 
 
+@pytest.mark.few(2, 3)
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("how", ["SIGTERM", "SIGHUP", "SIGINT", "SIGKILL"])
 def test_a_write_that_is_ended_leaves_nothing(environment, tmp_path: Path, how: str) -> None:

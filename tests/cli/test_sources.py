@@ -48,7 +48,9 @@ def test_of_each_stretch_the_sharpest_frame(video: Path, shipped: list[np.ndarra
     found = read_frames(video)
     assert found.count == 8 * len(shipped)
     assert 40 <= len(found.pictures) <= 80
-    assert [one.name for one in found.pictures] == [one.name for one in read_frames(video).pictures]
+    for one, again in zip(found.pictures, read_frames(video).pictures, strict=True):
+        assert one.name == again.name
+        np.testing.assert_array_equal(one.gray, again.gray)
     numbers = [int(one.name.split()[-1]) for one in found.pictures]
     sharp = [n for n in numbers if n % 8 == 5]
     assert len(sharp) == len(shipped), "no sharp frame was passed over"
@@ -67,9 +69,6 @@ def test_a_video_makes_the_camera_of_its_views(calib, video, project_root, tmp_p
     assert camera["rms_px"] < 1.1 * still["rms_px"]
     inputs = yaml.safe_load(rig.read_text())["provenance"]["inputs"]["camera"]
     assert list(inputs) == ["clip.avi"]
-    before = rig.read_bytes()
-    calib("intrinsics", video, *RADIAL2, "--rig", rig)
-    assert rig.read_bytes() == before
 
 
 def _bag(path: Path, views: list[np.ndarray], encoding: str, topics: tuple[str, ...] = ("/image",)) -> Path:

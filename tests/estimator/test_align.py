@@ -90,6 +90,7 @@ def test_swing_and_ellipse_align_a_rig() -> None:
     assert list(figures) == ["align_correlation", "align_residuals_1", "align_residuals_2"]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("pace", [0.0, 0.003, -0.01])
 def test_a_camera_on_a_faster_clock_is_told(pace: float) -> None:
     """As of a video whose frames are counted by a nominal rate."""
@@ -165,6 +166,7 @@ def test_at_rest_only_the_sum_is_known() -> None:
     assert np.abs(scores(trial, found)).max() < 4.0
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("way", ["good", "late", "frozen"])
 def test_a_coordinate_that_lags_or_stands_is_not_ok(way: str) -> None:
     trial = known(SimulatedRig())
@@ -205,6 +207,7 @@ def test_a_swing_of_four_pictures_in_a_period_is_aligned() -> None:
     assert abs(found.sensor[OFFSET] - 0.025) < 3.0 * found.sigma[OFFSET] < 3e-3
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("turned_deg", "bias_radps", "late_s", "words", "word"),
     [
@@ -236,6 +239,7 @@ def test_sigma_holds_what_is_another_in_one_log(
     assert abs(found.rest_angle_rad - true_rest) < 3.0 * found.rest_angle_sigma
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("late_s", "scenarios", "word"),
     [
@@ -275,6 +279,7 @@ def test_columns_that_are_swapped_are_judged() -> None:
     assert judge(align(logs, prior_settings(trial.view))).word == "unidentifiable"
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("aside_m", [0.0, 5e-5, -3e-4])
 def test_a_marker_aside_is_held_by_sigma_or_told(aside_m: float) -> None:
     """0.3 mm turned the angle by 0.3 degrees, 20 of its deviations."""
@@ -658,6 +663,7 @@ def test_a_twitch_at_the_start_of_a_rest_turns_nothing_round() -> None:
         start(pieces, [log], 0.025)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("more_s", [0.25, 0.7])
 def test_a_stream_that_comes_late_is_aligned(more_s: float) -> None:
     """Streams over a network show what was half a second ago."""

@@ -90,7 +90,7 @@ def _judged(log: Log) -> tuple[str, float]:
 @pytest.mark.parametrize(
     "scenario",
     [
-        "static",
+        pytest.param("static", marks=pytest.mark.slow),
         "swing",
         pytest.param("step", marks=pytest.mark.slow),
         pytest.param("elongation", marks=pytest.mark.slow),
@@ -122,6 +122,7 @@ def _delayed(log: Log, names: tuple[str, ...], samples: int) -> Log:
     return replace(log, columns=columns)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("scenario", ["swing", "ellipse", "step"])
 @pytest.mark.parametrize(
     ("late", "samples", "told"),
@@ -177,6 +178,7 @@ def test_delays_are_not_looked_for_in_a_log_at_rest() -> None:
     assert not list(untimely(setup_for(varied_drive(0)), rows_from(late)))
 
 
+@pytest.mark.few(0, 3)
 @pytest.mark.parametrize("scenario", ["static", "ellipse"])
 @pytest.mark.parametrize(
     ("name", "px", "lasts_s"),

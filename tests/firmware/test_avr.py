@@ -43,6 +43,7 @@ TICK_CYCLES = 266_667
 STAGES = ("", "angle", "plane", "offset", "low-pass", "lengths", "control")
 
 
+@pytest.mark.few(1, 6, 9)
 @pytest.mark.parametrize("progmem", [False, True])
 @pytest.mark.parametrize("undistort", [0, 1])
 @pytest.mark.parametrize("kind", ["nominal", "full", "levelling"])
@@ -63,6 +64,7 @@ def test_the_same_values_as_in_float64(tmp_path: Path, kind: str, undistort: int
     assert sizes["ram"] + found.stack <= 300 + 60 * (kind != "nominal") + tables + 20 * (kind == "levelling")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("undistort", [0, 1])
 @pytest.mark.parametrize("kind", ["fused", "full"])
 def test_the_fused_estimator_gives_the_same_values(tmp_path: Path, kind: str, undistort: int) -> None:
@@ -79,6 +81,7 @@ def test_the_fused_estimator_gives_the_same_values(tmp_path: Path, kind: str, un
     assert sizes["ram"] + found.stack <= 300
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", ["nominal", "fused", "full"])
 def test_the_self_test_passes_on_the_board(tmp_path: Path, kind: str) -> None:
     write(tmp_path, header(kind))
@@ -256,6 +259,7 @@ def experiment(name: str) -> tuple[np.ndarray, int]:
     return np.full((len(times), 2), 0.7), MODE_ORIENTATION
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", ["ellipse", "step"])
 @pytest.mark.parametrize(
     ("where", "kind", "fused"),
@@ -281,6 +285,7 @@ def test_the_loop_closed_by_the_processor_is_that_of_float64(
     assert np.ptp(expected[:, 0]) > 0.005
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("kind", "flags", "most"),
     [

@@ -80,6 +80,7 @@ def test_same_rig_same_bytes() -> None:
     assert again.digest == header().digest
 
 
+@pytest.mark.few(0, 9, 12, 21)
 @pytest.mark.parametrize("fused", [0, 1])
 @pytest.mark.parametrize(("compiler", "flags"), COMPILERS, ids=lambda v: v.replace(" ", ""))
 def test_every_constant_compiles_to_numpys_bits(
@@ -127,6 +128,7 @@ def test_what_does_not_fit_does_not_compile(tmp_path: Path, line: str, message: 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["nominal", "full", "levelling"])
 def test_every_macro_is_read_or_says_what_it_is_for(kind: str) -> None:
     """The firmware reads it, or its comment or that of its group tells that a person's program may."""

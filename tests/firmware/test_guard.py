@@ -160,6 +160,7 @@ def test_without_a_fault_it_starts_and_runs(board: Built) -> None:
     assert result.verdict.ok and result.ticks > 200 and result.worst["q_m"] < 2e-7
 
 
+@pytest.mark.slow
 def test_a_camera_with_nearly_the_ticks_rate_is_not_lost(board: Built) -> None:
     """Pictures come with the ticks: for three seconds each third tick has none. The limit is a fifth."""
     simulated = Board(board, frame_hz=60.1)
@@ -171,6 +172,7 @@ def test_a_camera_with_nearly_the_ticks_rate_is_not_lost(board: Built) -> None:
     assert set(states[states.index(GUARD_RUN) :]) == {GUARD_RUN}
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("fault", ["bus_hang", "marker_frozen", "beyond_reach"])
 def test_a_fault_stops_the_pumps(board: Built, fault: str) -> None:
     ended = _run(board, fault)
@@ -197,6 +199,7 @@ def test_a_fault_at_any_time_stops_the_pumps(board: Built) -> None:
         assert kept(fault, off_ms, again), fault
 
 
+@pytest.mark.slow
 def test_a_bus_that_hangs_from_the_start_keeps_the_pumps_off(board: Built) -> None:
     ended = _run(board, "bus_hang", 0.0, 2000.0, 5500.0)
     assert ended.off_after_ms == pytest.approx(0.0, abs=1.0)
@@ -213,6 +216,7 @@ def test_another_chip_is_not_believed(board: Built) -> None:
     assert not ended.runs and ended.on_during_ms == 0.0
 
 
+@pytest.mark.slow
 def test_a_pump_at_full_power_without_effect_is_stopped(board: Built) -> None:
     ended = _run(board, "stuck", 0.0, 7500.0, 7500.0)
     assert not ended.runs and ended.faults == {FULL_POWER}
@@ -220,6 +224,7 @@ def test_a_pump_at_full_power_without_effect_is_stopped(board: Built) -> None:
     assert ended.frames[-1].guard is not None and ended.frames[-1].guard.state == GUARD_FAULT
 
 
+@pytest.mark.slow
 def test_a_reset_leaves_the_pumps_off_until_all_is_sound(board: Built) -> None:
     ended = _run(board, "reset", AT_MS, AT_MS + 400.0, END_MS)
     assert 0.0 <= ended.off_after_ms <= 1.0

@@ -198,6 +198,7 @@ def test_the_self_test_passes_and_sees_a_wrong_constant(
     assert codes == [0, 1]
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("rate_hz", [12.0, 30.0, 150.0])
 def test_the_self_test_passes_at_other_ticks(tmp_path: Path, rate_hz: float) -> None:
     """At 15 Hz and below the head turned on beyond what a float follows, and the fused board never ran."""
@@ -236,6 +237,7 @@ def test_signs_of_the_imus_axes(tmp_path: Path) -> None:
     assert (np.abs(found.numbers - wanted).max(axis=0) <= LIMITS).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("order", [2, 5, 8])
 def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     from calib.stages.firmware.header import header_of
@@ -458,6 +460,7 @@ def test_the_levelling_filter_is_the_projects_own(seed: int) -> None:
     assert error[late].std() < 0.05 * np.degrees((wanted - arm.phi)[late].std())
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("lost_s", "most_deg"), [(0.05, 0.6), (0.2, 0.6), (2.0, 1.4)])
 def test_an_imu_that_was_lost_in_motion_leaves_no_error_in_the_levelled_angle(
     lost_s: float, most_deg: float
@@ -471,6 +474,7 @@ def test_an_imu_that_was_lost_in_motion_leaves_no_error_in_the_levelled_angle(
         assert np.sqrt(np.mean(error[120:300] ** 2)) < most_deg
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("mode", [MODE_ORIENTATION, MODE_POSITION])
 def test_every_stage_is_the_projects_own(mode: int) -> None:
     """Stage by stage, each fed with what the reference had before it; binary32 constants cost 1e-6."""
@@ -507,6 +511,7 @@ def test_every_stage_is_the_projects_own(mode: int) -> None:
         assert out.pwm == pytest.approx(np.clip(u, 0.0, 255.0), abs=1e-3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["nominal", "full"])
 def test_they_reach_every_branch_but_the_angles_limit(kind: str) -> None:
     seen = 0
@@ -519,6 +524,7 @@ def test_they_reach_every_branch_but_the_angles_limit(kind: str) -> None:
     assert not seen & ANGLE_LIMIT
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["fused", "full"])
 def test_they_reach_every_branch(kind: str) -> None:
     seen, resting = 0, 0
@@ -530,6 +536,7 @@ def test_they_reach_every_branch(kind: str) -> None:
     assert resting > 10
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["fused", "full"])
 def test_the_estimator_follows_the_motion(kind: str) -> None:
     """Pictures, gyroscope and accelerometer tell one story: the estimate is near the motion they are of."""

@@ -218,6 +218,7 @@ def test_a_board_that_restarts_ends_the_recording(bare: Built, tmp_path: Path) -
     assert len(read_log(tmp_path / "log.csv")) > 100
 
 
+@pytest.mark.slow
 def test_the_head_is_let_go_when_it_is_held_still_and_not_before(bare: Built, tmp_path: Path) -> None:
     simulated = SimulatedBoard(bare)
     done, words = _do(simulated, EXPERIMENTS["swing"], tmp_path / "log.csv")

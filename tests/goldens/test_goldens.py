@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from goldens import goldens
 
-QUICK = ("shipped", "pump", "poor")
+QUICK = ("shipped", "poor")
 
 
 @pytest.mark.parametrize(

@@ -539,6 +539,7 @@ def trials(shared_data: Path) -> dict[str, Trial]:
     return out
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize("trial", list(FILES))
 @pytest.mark.parametrize(
     "peer", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in PUBLISHED_DEG]
@@ -551,6 +552,7 @@ def test_published_figures_are_reproduced(trials: dict[str, Trial], trial: str, 
     assert found == pytest.approx(PUBLISHED_DEG[peer][trial], abs=0.01)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("trial", list(FILES))
 def test_levelling_is_as_good_as_vqf(trials: dict[str, Trial], trial: str) -> None:
     """One set of parameters, on the recording and on what others might have made of it.
@@ -568,6 +570,7 @@ def _levelled(one: Trial) -> np.ndarray:
     return level_three(Levelling(), one.period_s * np.arange(len(one.gyro)), one.force, one.gyro)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize(("trial", "times"), [("02", 5.0), ("05", 1.4)])
 @pytest.mark.parametrize("least", [0.25, 0.5])
 def test_the_up_vector_makes_the_filter_better_in_plane(
@@ -644,6 +647,7 @@ def _error(phi: np.ndarray, truth: np.ndarray, offset: float) -> np.ndarray:
     return np.degrees(np.sqrt(np.mean(wrapped(phi - truth - offset) ** 2, axis=-1)))
 
 
+@pytest.mark.few(0, 5)
 @pytest.mark.parametrize("reference", [True, False])
 @pytest.mark.parametrize("seed", [0, 1, 3, 4])
 def test_near_the_best_of_all_constant_gains(seed: int, reference: bool) -> None:
@@ -748,6 +752,7 @@ def test_a_reference_that_turns_too_far_is_named(factor: float) -> None:
     assert found.text.startswith("arm.csv:") and "contradict each other" in found.text
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("reference", [True, False])
 @pytest.mark.parametrize("lever_m", [0.05, 0.2])
 def test_a_sound_log_does_not_contradict_itself(reference: bool, lever_m: float) -> None:

@@ -236,6 +236,7 @@ def _spread(error: np.ndarray) -> float:
     return float((error - error.mean()).std())
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("seed", range(4))
 def test_beats_the_filter_on_a_swung_arm(seed: int) -> None:
     arm = swung(seed)

@@ -386,11 +386,8 @@ def _check_chart(figure: Figure) -> None:
 
 QUICK = (
     "camera: sigma not bounded",
-    "camera: no distortion, odd names",
     "lens: Brown",
-    "plane: 316x208",
     "plane: nothing of the workspace",
-    "low-pass: order 1",
     "control: a jump checked",
 )
 

@@ -160,6 +160,7 @@ def _symmetry_centres(grey: np.ndarray, start: np.ndarray) -> np.ndarray:
     return np.array(centres)
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize(
     ("model", "skew_px", "printed", "sensor"),
     [
@@ -279,6 +280,7 @@ def test_noise_is_standard_normal() -> None:
     np.testing.assert_allclose(quantiles, [-2.0, -1.0, 1.0, 2.0], atol=0.03)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("seed", range(6))
 def test_clutter_is_cluttered_but_holds_no_board(seed: int) -> None:
     picture = clutter((316, 208), seed)
