@@ -145,7 +145,10 @@ def _answer(
     used = [job for job in jobs if job["flashed"]]
     broken = [job for job in used if job["status"] in ("failed", "blocked")]
     if broken:
-        return "no", f"{_titles(broken)} failed"
+        # What failed mostly did so because of what came before it.
+        before = [job for job in jobs[: jobs.index(broken[0])] if job["status"] in _MEANINGLESS]
+        why = f"; the data do not support {_titles(before)}" if before else ""
+        return "no", f"{_titles(broken)} failed{why}"
     senseless = [job for job in used if job["status"] in _MEANINGLESS]
     if senseless:
         return "no", f"the data do not support {_titles(senseless)}"

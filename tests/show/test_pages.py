@@ -319,6 +319,11 @@ def test_answers(statuses: dict[str, str], answer: str) -> None:
     assert decide(_whole(**statuses), SECTIONS).answer == answer
 
 
+def test_what_the_data_do_not_support_is_said_of_what_failed_behind_it() -> None:
+    found = decide(_whole(intrinsics="inconsistent", extrinsics="failed"), SECTIONS)
+    assert found.headline == "“Extrinsics” failed; the data do not support “Intrinsics”"
+
+
 def test_without_a_plane_logs_cannot_be_flashed_and_pictures_alone_can() -> None:
     told = _whole(extrinsics="skipped")
     camera = {"camera": {"verdict": "ok"}}
