@@ -406,6 +406,18 @@ def test_what_is_stated_is_held_against_the_logs(name: str, share: float) -> Non
     assert abs(value - truth) < max(5.0 * sigma, 0.2 * abs(share - 1.0) * truth)
 
 
+@pytest.mark.parametrize(("full", "unit"), [(255.0, ""), (100.0, "unit: percent"), (1.0, "factor: 255")])
+def test_commands_in_other_units_are_named(full: float, unit: str) -> None:
+    tracks = [replace(one, pwm=one.pwm * full / 255.0) for one in (track("prbs"), track("chirp", seed=2))]
+    problem = Problem(Machine(), tracks, ("stiffness_scale",), {})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    fixed = dict.fromkeys(("strength1", "strength2"), "the logs do not depend on it")
+    found = Solution(problem, x, residual, J, cost, fixed, 1, 1)
+    verdict = judge(found, uncertainty(found), colour_of(found), [], [])
+    assert any("below which the pumps give no force" in one.text for one in verdict.findings) == bool(unit)
+    assert any("pwm1: {column: pwm1, " + unit in one.advice for one in verdict.findings) == bool(unit)
+
+
 @pytest.mark.few(0, 1)
 @pytest.mark.parametrize("swapped", [(), (1,), (0, 1)])
 def test_pumps_that_are_swapped_are_named(swapped: tuple[int, ...]) -> None:

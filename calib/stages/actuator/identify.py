@@ -2066,6 +2066,12 @@ def judge(
         else:
             text = f"{label_of(name)} is not identifiable from these logs: {why}"
             out.append(Finding("unidentifiable", text))
+    most = max((float(track.pwm.max()) for track in solution.problem.tracks if track.hoses), default=0.0)
+    if 0.0 < most <= 100.0 and {"strength1", "strength2"} <= solution.fixed.keys():
+        unit = "unit: percent" if most > 1.0 else "factor: 255"
+        text = f"no command exceeds {most:.3g} of 255, below which the pumps give no force"
+        said = f"of other units, say pwm1: {{column: pwm1, {unit}}} in columns.yaml, and pwm2 so"
+        out.append(Finding("unidentifiable", text, said))
     fixed = [label_of(name) for name, sigma in solution.problem.stated.items() if not sigma]
     if fixed:
         out.append(Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}"))
