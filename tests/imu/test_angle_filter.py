@@ -761,6 +761,15 @@ def test_a_sound_log_does_not_contradict_itself(reference: bool, lever_m: float)
         assert contradictions(pieces, tune(pieces, DATA_SHEET)) == []
 
 
+def test_the_noise_of_a_reference_contradicts_nothing() -> None:
+    """As of a marker that jumps by two pixels in a swing of five degrees."""
+    piece = _piece(3, True)
+    assert piece.reference_rad is not None
+    noise = 0.4 * np.nanstd(piece.reference_rad) * np.random.default_rng(0).normal(size=len(piece.t_s))
+    noisy = [replace(piece, reference_rad=piece.reference_rad + noise)]
+    assert contradictions(noisy, tune(noisy, DATA_SHEET)) == []
+
+
 def test_a_sensor_that_was_mounted_otherwise_in_one_log_is_named() -> None:
     pieces = [replace(_piece(seed, True), source=f"{seed}.csv") for seed in (0, 1, 3)]
     seen = pieces[2].reference_rad

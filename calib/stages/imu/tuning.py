@@ -922,7 +922,10 @@ def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> s
         rest = b - scale * a
         near = np.abs(rest) <= 4.0 * max(robust_sigma(rest), 1e-6)
         scale = float(a[near] @ b[near]) / max(float(a[near] @ a[near]), 1e-12)
-    left_rad = robust_sigma(b - scale * a)
+    rest = b - scale * a
+    # What jumps from sample to sample is the reference's own noise, as that of a marker in whole pixels.
+    noise_rad = robust_sigma(np.diff(rest)) / math.sqrt(2.0)
+    left_rad = math.sqrt(max(robust_sigma(rest) ** 2 - noise_rad**2, 0.0))
     most = max(float(a.std()), float(b[np.abs(b) <= 4.0 * b.std()].std()))
     if left_rad > max(_MOST_APART * most, _MOST_APART_RAD):
         return f"the rate leaves {math.degrees(left_rad):.2g} of {math.degrees(most):.2g} deg unexplained"
