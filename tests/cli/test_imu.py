@@ -73,7 +73,7 @@ def test_of_several_logs_one_that_cannot_be_used_is_left_out(
     """It is named, and more than a fifth of the logs make the result poor."""
     rig, spoilt, moved = tmp_path / "rig.yaml", tmp_path / "spoilt.csv", tmp_path / "moved.csv"
     lines = logs[0].read_text().splitlines()
-    spoilt.write_text("\n".join([*lines[:300], "abc" + lines[300], *lines[301:]]) + "\n")
+    spoilt.write_text("\n".join([*lines[:300], *("abc" + line for line in lines[300:])]) + "\n")
     sound = [_write(tmp_path / f"rest{k}.csv", _at_rest() + 1e-4 * k) for k in range(4)]
     said = "1 of 5 logs cannot be used and is left out: spoilt.csv, line 301: t_s is 'abc"
     ended = calib("imu", "static", sound[0], spoilt, *sound[1:], "--rig", rig)
