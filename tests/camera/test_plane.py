@@ -699,3 +699,37 @@ def test_reported_and_empirical_sigma_agree(noise_px: float, part: str) -> None:
     # Place by place, where each empirical figure is itself uncertain by 4 %.
     by_place = np.sqrt(stated / empirical)
     assert np.all(np.abs(by_place - 1.0) < 0.15), (by_place.min(), by_place.max())
+
+
+@pytest.mark.parametrize(
+    ("kind", "word", "says"),
+    [
+        ("as taken", "ok", ""),
+        ("zoomed", "poor", "zoomed, cropped or refocused"),
+        ("cropped", "poor", "zoomed, cropped or refocused"),
+        ("mirrored", "poor", "mirrored left to right"),
+        ("turned", "poor", "turned by half a turn"),
+    ],
+)
+def test_a_picture_that_is_not_as_the_camera_took_it_is_told(kind: str, word: str, says: str) -> None:
+    """Corners miss by .03 to .1 px, and markers are read 5 to 20 mm beside."""
+    camera = replace(THESIS, cx_px=160.7, cy_px=101.9)
+    other = (
+        replace(camera, fx_px=1.15 * camera.fx_px, fy_px=1.15 * camera.fy_px) if kind == "zoomed" else camera
+    )
+    view = picture_plane_checks("a", *pose_at(0.1, 0.25), 0.006, other)
+    flip = {"mirrored": (-1.0, 1.0), "turned": (-1.0, -1.0)}.get(kind, (1.0, 1.0))
+    middle = np.array([157.5, 103.5])
+    pixels = (view.pixels - middle) * flip + middle - (12.0 if kind == "cropped" else 0.0)
+    world = WORLD * [flip[0] * flip[1], 1.0]
+    plane = calibrate_plane(camera, 1e-4 * COVARIANCE, [View("a", world, pixels)], camera_rms_px=0.0086)
+    assert plane.verdict.word == word
+    assert all(says in reason for reason in plane.verdict.reasons)
+
+
+def test_corners_stated_the_other_way_round_are_doubted() -> None:
+    board = Board(5, 7, 0.02)
+    upright = picture_placement(THESIS_PLACEMENT, 0.05, 4.0)
+    seen = np.rot90(upright.reshape(5, 7, 2), 1).reshape(-1, 2)
+    assert "5x7 may be the wrong order of corners" in settle_orientation(seen, board, 0.05).doubt
+    assert not settle_orientation(upright, THESIS_PLACEMENT, 0.05).doubt

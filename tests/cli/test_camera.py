@@ -237,6 +237,16 @@ def test_pictures_of_another_size(calib, folder, rig) -> None:
     assert ended.sentence == "plane01.png: is 632x416 px, expected 316x208 px"
 
 
+def test_another_square_for_as_many_corners_is_doubted(calib, folder, rig) -> None:
+    above = folder.parent / "board.yaml"
+    above.write_text("corners: [7, 5]\nsquare_m: 0.025\n")
+    ended = calib("extrinsics", folder, "--rig", rig)
+    assert ended.code == 1
+    assert "plane/board.yaml says squares of 20 mm" in ended.out
+    above.write_text("corners: [7, 5]\n")
+    assert calib("extrinsics", folder, "--rig", rig).code == 0
+
+
 def test_a_plane_is_no_better_than_its_camera(calib, folder, rig) -> None:
     rig.write_text(rig.read_text().replace("verdict: ok", "verdict: poor", 1))
     ended = calib("extrinsics", folder, "--rig", rig)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from calib.core.geometry import (
 )
 from calib.core.verdict import Finding, Verdict
 from calib.solve.chance import tail_of_f
-from calib.stages.camera.model import Board, Camera, View, project, undistort
+from calib.stages.camera.model import INTRINSICS, Board, Camera, View, project, undistort
 from calib.stages.camera.pose import Pose, fit_pose, plane_map, plane_pixels, pose_derivatives
 
 # ----------------------------------------------------------------------
@@ -138,6 +139,11 @@ _HOMOGRAPHY_FACTOR, _HOMOGRAPHY_POINTS = 2.0, 10
 """A homography that is free to bend to the pixels must not fit this much better than the pose."""
 _OFF_SIGMAS, _OFF_SHARE = 3.0, 5e-4
 """Nor put corners so many standard deviations of the calibration, and this share of the board, elsewhere."""
+_OTHER_FACTOR, _OTHER_LEAST_PX = 2.0, 1e-3
+"""A picture that was zoomed, cropped, turned or mirrored must not fit this much better, unless by rounding:
+35 pictures of seven sets reach 1.6."""
+_OTHER_STEPS, _OTHER_ZOOM = 4, 0.3
+"""Steps to that zoom and centre, and the logarithm of the zoom that one may take."""
 _ELEVATION_LOST_DEG, _ELEVATION_POOR_DEG = 3.0, 15.0
 """Angle between the line of sight and the plane: an error across it grows with its inverse sine."""
 _SPREAD_LOST_PX = 1.5
@@ -314,6 +320,8 @@ def _of_residuals(camera: Camera, plane: Plane, camera_rms_px: float | None) -> 
             "px: the picture was undistorted before, or is another camera's",
             "give the picture as it was taken",
         )
+    elif (other := _another_picture(camera, plane)) is not None:
+        yield other
     elif rms > _RMS_LIMIT_PX:
         text = (
             f"the corners miss their places by {rms:.2f} px RMS (limit {_RMS_LIMIT_PX:g}): wrong square, "
@@ -342,6 +350,81 @@ def _of_residuals(camera: Camera, plane: Plane, camera_rms_px: float | None) -> 
                 "are not the real ones"
             )
             yield Finding("poor", text, "measure the printed squares along both sides; lay the board flat")
+
+
+def _another_picture(camera: Camera, plane: Plane) -> Finding | None:
+    """Whether corners fit far better as if the picture had been zoomed or cropped, turned or mirrored.
+
+    One view of a plane hardly tells these by its pose: corners that miss by hundredths of a pixel may stand
+    for a marker that is read centimetres beside.
+    """
+    world_m, pixels, points = plane.corners_m, plane.corners_px, plane.sigma.points_m
+    if plane.rms_px < _OTHER_LEAST_PX:
+        return None
+    advice = "give the picture as the camera took it, with the zoom and size that it was calibrated with"
+    at = np.array(camera.image_size_px) - 1.0
+    flips = {
+        "mirrored left to right": (True, False),
+        "mirrored upside down": (False, True),
+        "turned by half a turn": (True, True),
+    }
+    flipped: dict[str, float] = {}
+    for how, turned in flips.items():
+        mirror = np.array([1.0, 1.0 if all(turned) else -1.0])
+        with suppress(BadInputError):
+            flipped[how] = fit_pose(camera, world_m * mirror, np.where(turned, at - pixels, pixels)).rms_px
+    how = min(flipped, key=lambda one: flipped[one], default="")
+    if how and plane.rms_px > _OTHER_FACTOR * flipped[how]:
+        text = (
+            f"as if the picture had been {how} the corners fit to {flipped[how]:.2g} px, as it is to "
+            f"{plane.rms_px:.2g} px"
+        )
+        return Finding("poor", text, advice)
+    try:
+        other, fit = _zoomed(camera, plane)
+    except (BadInputError, np.linalg.LinAlgError):
+        return None
+    if plane.rms_px < _OTHER_FACTOR * fit.rms_px:
+        return None
+    # Markers are seen by the camera as it was calibrated, from where the board's picture puts it.
+    seen = plane_pixels(camera, fit.R_CW, fit.t_CW_m, points)
+    off_mm = 1e3 * np.linalg.norm(plane_map(camera, plane.R_CW, plane.t_CW_m, seen) - points, axis=1)
+    off_mm = off_mm[np.isfinite(off_mm)]
+    known_mm = float(np.nanmax(np.linalg.norm(plane.sigma.calibration_mm, axis=1)))
+    size_mm = 1e3 * float(np.hypot(*np.ptp(world_m, axis=0)))
+    if not off_mm.max(initial=0.0) > max(_OFF_SIGMAS * known_mm, _OFF_SHARE * size_mm):
+        return None
+    text = (
+        f"with {100 * other.fx_px / camera.fx_px:.1f} % of the focal length and its centre at "
+        f"({other.cx_px:.1f}, {other.cy_px:.1f}) the corners fit to {fit.rms_px:.2g} px, with the camera's "
+        f"to {plane.rms_px:.2g} px, and markers would be up to {off_mm.max():.1f} mm elsewhere: the picture "
+        "was zoomed, cropped or refocused, or the board is bent"
+    )
+    return Finding("poor", text, f"{advice}; lay the board flat")
+
+
+def _zoomed(camera: Camera, plane: Plane) -> tuple[Camera, Pose]:
+    """The camera with the zoom and centre that the plane's picture alone gives it, and the pose by it."""
+    other, fit = camera, Pose(**{one.name: getattr(plane, one.name) for one in fields(Pose)})
+    for _ in range(_OTHER_STEPS):
+        _, by_pose, by_camera = pose_derivatives(other, fit.R_CW, fit.t_CW_m, plane.corners_m)
+        fx, fy, cx, cy = (
+            by_camera[..., INTRINSICS.index(name)] for name in ("fx_px", "fy_px", "cx_px", "cy_px")
+        )
+        zoom = other.fx_px * fx + other.fy_px * fy
+        J = np.concatenate([np.stack([zoom, cx, cy], axis=2), by_pose], axis=2).reshape(-1, 9)
+        unit = 1.0 / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        step = (-unit * np.linalg.lstsq(J * unit, fit.residuals_px.ravel(), rcond=None)[0]).tolist()
+        share = math.exp(min(max(step[0], -_OTHER_ZOOM), _OTHER_ZOOM))
+        other = replace(
+            other,
+            fx_px=other.fx_px * share,
+            fy_px=other.fy_px * share,
+            cx_px=other.cx_px + step[1],
+            cy_px=other.cy_px + step[2],
+        )
+        fit = fit_pose(other, plane.corners_m, plane.corners_px)
+    return other, fit
 
 
 def _of_horizon(camera: Camera, plane: Plane) -> Iterator[Finding]:
@@ -569,6 +652,9 @@ def moved_m(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray
 # axis point to the right in the picture, unless the user says where the first corner is seen. Where the
 # board's colours tell its ends apart, and say otherwise, the answer comes with that doubt.
 
+_SIDEWAYS_DEG = 60.0
+"""A world's x axis that far from the picture's right is a rule's answer that a person has to confirm: corners
+stated as rows x columns, or a camera on its side, make it."""
 _UNDECIDED_DEG = 0.5
 """Two turns are told apart only when the axis is at least this far from the border between them."""
 
@@ -689,6 +775,11 @@ def settle_orientation(
             f"{name}: by the board's colours, dark across corner (0, 0), that corner is at pixel "
             f"({u:.1f}, {v:.1f}), by the world's x axis, which points right, at ({chosen[0, 0]:.1f}, "
             f"{chosen[0, 1]:.1f})"
+        )
+    elif abs(degrees) > _SIDEWAYS_DEG:
+        doubt = (
+            f"{name}: the world's x axis points {_words(degrees)} in the picture: {board.columns}x"
+            f"{board.rows} may be the wrong order of corners, or angle_rad that of the other axis"
         )
     return Placement(chosen, turn, degrees, how, doubt)
 

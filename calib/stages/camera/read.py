@@ -131,6 +131,31 @@ def _of_board(file: BoardFile) -> tuple[object, ...]:
     return file.corners, file.square_m, file.dictionary
 
 
+_SAME_SQUARE = 1e-3
+"""Share by which two statements of a square may differ, .1 mm over a decimetre."""
+
+
+def another_square(folder: Path, stated: BoardFile) -> tuple[str, str] | None:
+    """What the folder above tells of the squares otherwise, and what to do; None where it does not."""
+    try:
+        above = read_board_file(folder.parent)
+    except BadInputError:
+        return None
+    if stated.corners is None or above.corners is None or sorted(stated.corners) != sorted(above.corners):
+        return None
+    if stated.square_m is None or above.square_m is None:
+        return None
+    if abs(above.square_m / stated.square_m - 1.0) < _SAME_SQUARE:
+        return None
+    here, there = f"{1e3 * stated.square_m:g} mm", f"{1e3 * above.square_m:g} mm"
+    where = shown(folder.parent / BOARD_FILE)
+    return (
+        f"{shown(folder / BOARD_FILE)} says squares of {here}, {where} of {there}, with as many corners: all "
+        "lengths on the plane go with the former",
+        f"measure a square; where these are two boards, leave square_m out of {where}, which needs none",
+    )
+
+
 @dataclass(frozen=True)
 class BoardSearch:
     """What a set of pictures shows.

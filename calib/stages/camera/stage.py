@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
     from calib.core.plot import Figure
     from calib.core.rig import Rig
+    from calib.core.verdict import Finding
     from calib.core.words import Block
     from calib.stages.camera import lens, model, plane
     from calib.stages.camera.intrinsics import Candidate, Intrinsics
@@ -214,6 +215,9 @@ class PlaneEvidence:
     left_out: tuple[LeftOut, ...]
 
 
+_WHICH = "state which it is with first_corner_px: [u, v] in board.yaml"
+
+
 def _read_plane(
     files: Files, rig: Rig, options: NoOptions
 ) -> tuple[
@@ -221,16 +225,17 @@ def _read_plane(
     Sequence[model.View],
     tuple[float, float, float, float],
     Sequence[str],
-    str,
+    Sequence[Finding],
     tuple[LeftOut, ...],
     bool,
     plane.BoardPlace,
 ]:
     from calib.core.files import shown
+    from calib.core.verdict import Finding
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
     from calib.stages.camera.plane import BoardPlace, settle_orientation, world_points_m
-    from calib.stages.camera.read import BOARD_FILE, board_of, find_boards, meant_folder
+    from calib.stages.camera.read import BOARD_FILE, another_square, board_of, find_boards, meant_folder
 
     del options
     assert rig.camera is not None
@@ -240,7 +245,8 @@ def _read_plane(
         files.narrate(remark)
     pictures = list_pictures([source])
     stated, board_hash = board_of([source])
-    board_file = shown((source if source.is_dir() else source.parent) / BOARD_FILE)
+    folder = source if source.is_dir() else source.parent
+    board_file = shown(folder / BOARD_FILE)
     for key in ("corners", "square_m", "first_corner_m", "angle_rad"):
         if getattr(stated, key) is None:
             raise BadInputError(
@@ -257,7 +263,9 @@ def _read_plane(
             stated.dictionary,
         )
     world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
-    views, orientation, doubt = [], [], ""
+    views, orientation, doubts = [], [], list[Finding]()
+    if other := another_square(folder, stated):
+        doubts.append(Finding("poor", *other))
     for view in search.views:
         pixels, kept, how = view.pixels, view.measured, "The board's markers say which corner is (0, 0)."
         assert kept is not None
@@ -266,13 +274,14 @@ def _read_plane(
                 pixels, search.board, stated.angle_rad, stated.first_corner_px, view.name
             )
             pixels, kept, how = placed.pixels, placed.reordered(kept, search.board), placed.how
-            doubt = doubt or placed.doubt
+            if placed.doubt and not any(one.advice == _WHICH for one in doubts):
+                doubts.append(Finding("poor", placed.doubt, _WHICH))
         views.append(View(view.name, world_m[kept], pixels[kept]))
         orientation.append(f"{view.name}: {how}")
     files.hashes |= {**search.hashes, **board_hash, **rig.identities("camera")}
     x, y = stated.first_corner_m
     place = BoardPlace((x, y), stated.first_corner_sigma_m, stated.angle_sigma_rad)
-    return rig.camera, views, rig.workspace_m, orientation, doubt, search.left_out, stated.simulated, place
+    return rig.camera, views, rig.workspace_m, orientation, doubts, search.left_out, stated.simulated, place
 
 
 def _solve_plane(
@@ -280,7 +289,7 @@ def _solve_plane(
     views: Sequence[model.View],
     workspace_m: tuple[float, float, float, float],
     orientation: Sequence[str],
-    doubt: str,
+    doubts: Sequence[Finding],
     left_out: tuple[LeftOut, ...],
     simulated: bool,
     placed: plane.BoardPlace,
@@ -289,7 +298,7 @@ def _solve_plane(
     import numpy as np
 
     from calib.core.result import finite_or_none, judged
-    from calib.core.verdict import Finding, Verdict
+    from calib.core.verdict import Verdict
     from calib.stages.camera.plane import calibrate_plane
     from calib.stages.camera.section import Plane
 
@@ -297,10 +306,7 @@ def _solve_plane(
     fit = calibrate_plane(
         optics, covariance, views, workspace_m=box, camera_rms_px=camera.rms_px, placed=placed
     )  # fmt: skip
-    findings = [*fit.verdict.findings]
-    if doubt:
-        advice = "state which it is with first_corner_px: [u, v] in board.yaml"
-        findings.append(Finding("poor", doubt, advice))
+    findings = [*fit.verdict.findings, *doubts]
     sigma = np.sqrt(np.diag(fit.covariance))
     names = ("rotation_x_rad", "rotation_y_rad", "rotation_z_rad", "tx_m", "ty_m", "tz_m")
     parts = ("intrinsics", "plane", "calibration", "quantisation", "total")
