@@ -12,16 +12,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 from typer.core import TyperGroup
 
-from calib.cli.common import (
-    FiguresOption,
-    JsonOption,
-    RigOption,
-    emit_json,
-    narrate,
-    progress_bar,
-    say,
-    telling,
-)
+from calib.cli import common
 from calib.core.errors import EXIT_POOR
 from calib.core.files import shown
 from calib.core.options import LogOptions, options_of
@@ -45,8 +36,8 @@ def verb(stage: AnyStage) -> Callable[..., None]:
             paths,
             values["rig"],
             values.get("output"),
-            narrate,
-            progress_bar,
+            common.narrate,
+            common.progress_bar,
             figures=figures is not None,
             keep=False,
         )
@@ -77,9 +68,9 @@ def _parameters(stage: AnyStage) -> list[inspect.Parameter]:
             inspect.Parameter("output", kind, default=made.default, annotation=Annotated[shape, switch])
         )
     if stage.plots is not None:
-        out.append(inspect.Parameter("figures", kind, default=None, annotation=FiguresOption))
-    out.append(inspect.Parameter("rig", kind, default=Path("rig.yaml"), annotation=RigOption))
-    out.append(inspect.Parameter("as_json", kind, default=False, annotation=JsonOption))
+        out.append(inspect.Parameter("figures", kind, default=None, annotation=common.FiguresOption))
+    out.append(inspect.Parameter("rig", kind, default=Path("rig.yaml"), annotation=common.RigOption))
+    out.append(inspect.Parameter("as_json", kind, default=False, annotation=common.JsonOption))
     return out
 
 
@@ -140,16 +131,16 @@ def _run(stage: AnyStage, files: Files, options: Any, figures: Path | None, as_j
     outcome, after = carry_out(stage, files, options, files.rig_path, figures)
     sections = stage.sections(outcome)
     if figures is not None:
-        narrate(f"figures in {shown(figures)}")
+        common.narrate(f"figures in {shown(figures)}")
     if as_json:
-        emit_json(stage.as_json(outcome, files.written))
+        common.emit_json(stage.as_json(outcome, files.written))
     else:
         for line in as_text(stage.blocks(outcome)):
-            say(line)
+            common.say(line)
     for name in sections:
-        narrate(f"{after.name_in_file(name)} written to {shown(files.rig_path)}")
+        common.narrate(f"{after.name_in_file(name)} written to {shown(files.rig_path)}")
     for sentence in () if stage.remarks is None else stage.remarks(after):
-        narrate(sentence)
+        common.narrate(sentence)
     files.finish()
     if not stage.verdict(outcome).ok:
         raise typer.Exit(EXIT_POOR)
@@ -179,5 +170,5 @@ def group(name: str, words: str, cls: type[TyperGroup] = TyperGroup) -> typer.Ty
     made = typer.Typer(name=name, cls=cls, help=words, no_args_is_help=True, rich_markup_mode=None)
     for one in STAGES:
         if one.startswith(f"{name} "):
-            made.command(one.split()[-1])(telling(verb(stage(one))))
+            made.command(one.split()[-1])(common.telling(verb(stage(one))))
     return made

@@ -15,20 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from calib.core.errors import BadInputError
-from calib.io.serial import (
-    CLEAR,
-    FAULTS,
-    GUARD_FAULT,
-    GUARD_RUN,
-    Decoder,
-    Frame,
-    Hello,
-    ImuSample,
-    Message,
-    Picture,
-    Rows,
-    setting,
-)
+from calib.io import serial
 
 # ----------------------------------------------------------------------
 # Commands as shares of the greatest one, by the time since the beginning.
@@ -175,18 +162,18 @@ class Board:
 
     def __init__(self, port: Port, name: str) -> None:
         self.port, self.name = port, name
-        self.decoder = Decoder()
+        self.decoder = serial.Decoder()
         self._pumps: tuple[int, int] | None = None
         self._said: tuple[int, int] | None = None
         self._said_s = -math.inf
         self.hello = self._greet()
 
-    def _greet(self) -> Hello:
+    def _greet(self) -> serial.Hello:
         began, ticks = self.port.now_s(), False
         for message in self.messages():
-            if isinstance(message, Hello):
+            if isinstance(message, serial.Hello):
                 return message
-            ticks = ticks or isinstance(message, Frame)
+            ticks = ticks or isinstance(message, serial.Frame)
             if self.port.now_s() - began > _ANSWER_S:
                 break
         if ticks:
@@ -197,13 +184,13 @@ class Board:
             f"{self.name}: no answer within {_ANSWER_S:g} s, expected the sketch that calib firmware writes"
         )
 
-    def messages(self) -> Iterator[Message | None]:
+    def messages(self) -> Iterator[serial.Message | None]:
         """All that comes, for ever; None where nothing has. Says every `_PERIOD_S` what is wanted."""
         while True:
             now = self.port.now_s()
             # The board's buffer holds a few frames only.
             if now - self._said_s >= (_PERIOD_S if self._said == self._pumps else _LEAST_S):
-                self.port.write(setting(True, self._pumps))
+                self.port.write(serial.setting(True, self._pumps))
                 self._said, self._said_s = self._pumps, now
             found = False
             for message in self.decoder.feed(self.port.read()):
@@ -219,7 +206,7 @@ class Board:
     def close(self) -> None:
         """Pumps off, whatever happened."""
         self._pumps = None
-        self.port.write(setting(True))
+        self.port.write(serial.setting(True))
 
 
 def perform(
@@ -233,8 +220,8 @@ def perform(
 
     Raises `BadInputError` where the board restarts, falls silent, or does not let the pumps run.
     """
-    board.port.write(CLEAR)
-    _wait_for(board, lambda message: isinstance(message, ImuSample), "its IMU gives no samples")
+    board.port.write(serial.CLEAR)
+    _wait_for(board, lambda message: isinstance(message, serial.ImuSample), "its IMU gives no samples")
     before = _let_go(board, tell) if plan.by_hand else []
     try:
         if plan.command is not None:
@@ -246,9 +233,9 @@ def perform(
 
 
 def _recorded(
-    board: Board, plan: Experiment, level: float, write: Callable[[str], None], before: list[Message]
+    board: Board, plan: Experiment, level: float, write: Callable[[str], None], before: list[serial.Message]
 ) -> Done:
-    rows, imu, markers, overruns = Rows(), 0, 0, 0
+    rows, imu, markers, overruns = serial.Rows(), 0, 0, 0
     first_overruns: int | None = None
     top = level * min(board.hello.open_high, _MOST_PWM)
     damaged, heard_s = board.decoder.damaged, board.port.now_s()
@@ -260,10 +247,12 @@ def _recorded(
             if plan.command is not None:
                 first, second = plan.command(rows.time_s)
                 board.pumps((round(top * first), round(top * second)))
-            if message is None or isinstance(message, Hello | Frame):
-                if isinstance(message, Frame) or (isinstance(message, Hello) and rows.begins_anew(message)):
-                    kept = message.kept if isinstance(message, Hello) else 0
-                    why = f" ({FAULTS[kept]})" if kept in FAULTS else ""
+            if message is None or isinstance(message, serial.Hello | serial.Frame):
+                if isinstance(message, serial.Frame) or (
+                    isinstance(message, serial.Hello) and rows.begins_anew(message)
+                ):
+                    kept = message.kept if isinstance(message, serial.Hello) else 0
+                    why = f" ({serial.FAULTS[kept]})" if kept in serial.FAULTS else ""
                     raise BadInputError(
                         f"{board.name}: the board restarted after {rows.time_s:.1f} s{why}; record this again"
                     )
@@ -274,47 +263,47 @@ def _recorded(
                 continue
             heard_s = now
             write(rows.take(message))
-            if isinstance(message, ImuSample):
+            if isinstance(message, serial.ImuSample):
                 imu += 1
                 continue
             markers += message.seen
             first_overruns = message.overruns if first_overruns is None else first_overruns
             overruns = message.overruns - first_overruns
-            if plan.command is not None and message.guard.state == GUARD_FAULT:
+            if plan.command is not None and message.guard.state == serial.GUARD_FAULT:
                 raise BadInputError(
                     f"{board.name}: after {rows.time_s:.1f} s the guard stopped the pumps: "
-                    f"{FAULTS.get(message.guard.fault, message.guard.fault)}; see the envelope in rig.yaml, "
-                    "or record with a lower --level"
+                    f"{serial.FAULTS.get(message.guard.fault, message.guard.fault)}; see the envelope in "
+                    "rig.yaml, or record with a lower --level"
                 )
     finally:
         write(rows.rest())
     return Done(rows.time_s, imu, markers, rows.lost, board.decoder.damaged - damaged, overruns)
 
 
-def _lets_run(message: Message) -> bool:
-    return isinstance(message, Picture) and message.guard.state == GUARD_RUN
+def _lets_run(message: serial.Message) -> bool:
+    return isinstance(message, serial.Picture) and message.guard.state == serial.GUARD_RUN
 
 
-def _wait_for(board: Board, there: Callable[[Message], bool], lacks: str) -> None:
+def _wait_for(board: Board, there: Callable[[serial.Message], bool], lacks: str) -> None:
     """Until a message of some kind comes."""
     began, fault = board.port.now_s(), 0
     for message in board.messages():
         if message is not None and there(message):
             return
-        if isinstance(message, Picture):
+        if isinstance(message, serial.Picture):
             fault = message.guard.fault or fault
         if board.port.now_s() - began > _RUN_S:
             break
-    why = f" ({FAULTS[fault]})" if fault in FAULTS else ""
+    why = f" ({serial.FAULTS[fault]})" if fault in serial.FAULTS else ""
     raise BadInputError(f"{board.name}: the board answers, but {lacks}{why}")
 
 
-def _let_go(board: Board, tell: Callable[[str], None]) -> list[Message]:
+def _let_go(board: Board, tell: Callable[[str], None]) -> list[serial.Message]:
     """Say what to do with the head; what came in the last moment before it swings.
 
     The angle at rest is taken first, so that it does not matter how the IMU is mounted.
     """
-    recent: deque[tuple[float, Message]] = deque()
+    recent: deque[tuple[float, serial.Message]] = deque()
     rest: list[tuple[float, float]] = []
     zero: float | None = None
     moved_s = told_s = calm_s = -math.inf
@@ -326,12 +315,12 @@ def _let_go(board: Board, tell: Callable[[str], None]) -> list[Message]:
             raise BadInputError(
                 f"{board.name}: the head was not pulled aside and let go within {_HAND_S:g} s"
             )
-        if not isinstance(message, ImuSample | Picture):
+        if not isinstance(message, serial.ImuSample | serial.Picture):
             continue
         recent.append((now, message))
         while recent[0][0] < now - _BEFORE_S:
             recent.popleft()
-        if not isinstance(message, ImuSample):
+        if not isinstance(message, serial.ImuSample):
             continue
         spin = abs(message.rate[2])
         if zero is None:

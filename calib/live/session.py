@@ -19,16 +19,8 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.core.verdict import Verdict
+from calib.stages.camera import checks
 from calib.stages.camera.bundle import poses_with_camera, projection_sigma_px
-from calib.stages.camera.checks import (
-    Candidate,
-    Plan,
-    best_next_view,
-    cell_of,
-    evidence,
-    image_outline,
-    tilted,
-)
 from calib.stages.camera.corners import detect, find_size, follow, reduced, resized
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lattice import find_lattices, find_saddles
@@ -129,7 +121,7 @@ class Session:
     views: dict[str, View] = field(default_factory=dict)
     fit: Intrinsics | None = None
     history: list[Progress] = field(default_factory=list)
-    _plan: Plan | None = None
+    _plan: checks.Plan | None = None
     _past: deque[tuple[float, FloatArray]] = field(default_factory=lambda: deque(maxlen=60))
     _before: FloatArray | None = None
     _waits: bool = False
@@ -312,14 +304,14 @@ class Session:
             return
         some = fit.calibration
         if np.all(np.isfinite(some.normal)) and some.observations.views >= _BEFORE:
-            self._plan = self._not_taken(best_next_view(some, evidence(some).S.sum(axis=0)))
-        worst = projection_sigma_px(some, fit.covariance, image_outline(some.camera))
+            self._plan = self._not_taken(checks.best_next_view(some, checks.evidence(some).S.sum(axis=0)))
+        worst = projection_sigma_px(some, fit.covariance, checks.image_outline(some.camera))
         sigma = fit.covariance.sigma().get("fx_px", np.inf)
         known = worst[~np.isnan(worst)]
         largest = float(known.max()) if len(known) else np.inf
         self.history.append(Progress(some.observations.views, float(sigma), largest))
 
-    def _not_taken(self, plan: Plan | None) -> Plan | None:
+    def _not_taken(self, plan: checks.Plan | None) -> checks.Plan | None:
         """The plan less poses that a picture has; one that the fit leaves out is not in the plan's views."""
         if plan is None:
             return None
@@ -354,7 +346,7 @@ class Session:
             return _drawn(self._grid_at(self._plan, best), best.R_CT, says, best.away)
         camera = self._nominal()
         away, (u, v), where = _START[len(self.views) % len(_START)]
-        R = tilted(35.0, away)
+        R = checks.tilted(35.0, away)
         width, height = camera.image_size_px
         box = np.ptp(self._board().points_m(), axis=0)
         distance = camera.fx_px * float(np.hypot(*box)) / (0.5 * np.hypot(width, height))
@@ -371,7 +363,7 @@ class Session:
         grid = self._projected(camera, R, distance * ray, box)
         return _drawn(grid, R, says, away)
 
-    def _grid_at(self, plan: Plan, pose: Candidate) -> FloatArray:
+    def _grid_at(self, plan: checks.Plan, pose: checks.Candidate) -> FloatArray:
         """Corners (rows, columns, 2) of the board in a planned pose."""
         box = np.ptp(plan.target_m, axis=0)[:2]
         return self._projected(plan.calibration.camera, pose.R_CT, pose.t_m, box)
@@ -482,7 +474,7 @@ class Session:
         """Points in each cell of the picture."""
         counts = np.zeros((rows, columns), dtype=np.int64)
         for view in self.views.values():
-            at = cell_of(view.counted()[1], self._size(), columns, rows)
+            at = checks.cell_of(view.counted()[1], self._size(), columns, rows)
             np.add.at(counts, at[::-1], 1)
         return [list(map(int, row)) for row in counts]
 

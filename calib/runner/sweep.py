@@ -29,22 +29,8 @@ from calib.core.rig import SCHEMA, Rig
 from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.core.workers import Processes, Task
+from calib.runner import outcomes
 from calib.runner.cache import program
-from calib.runner.outcomes import (
-    LIMIT_S,
-    SAME,
-    Answer,
-    Outcome,
-    Progress,
-    Store,
-    arrow_table,
-    column,
-    run_all,
-    texts,
-    typed,
-    write_table,
-    write_timings,
-)
 from calib.stages.control.trial import control_model, run_controller
 from calib.stages.control.tuning import Tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
@@ -322,10 +308,10 @@ _PLANT = ("actuator", "pump", "twin")
 _HERE = Path("the sweep")
 
 
-def measured(case: Case, base: Base, seed: int, key: str, known: str) -> Answer:
+def measured(case: Case, base: Base, seed: int, key: str, known: str) -> outcomes.Answer:
     """Run a case; every failure is an outcome, none an exception. With a `known` key it is done already."""
     if known == key:
-        return Answer(Outcome(name=case.name, status=SAME, key=key))
+        return outcomes.Answer(outcomes.Outcome(name=case.name, status=outcomes.SAME, key=key))
     began, values, status, sentence = time.perf_counter(), dict[str, float | None](), "ok", ""
     try:
         values = run_case(base, case, seed)
@@ -334,8 +320,10 @@ def measured(case: Case, base: Base, seed: int, key: str, known: str) -> Answer:
         status = "broken" if code == EXIT_INTERNAL else "failed"
     spent = round(time.perf_counter() - began, 4)
     numbers = {name: (value, None) for name, value in values.items()}
-    return Answer(
-        Outcome(name=case.name, status=status, sentence=sentence, key=key, values=numbers, seconds=spent)
+    return outcomes.Answer(
+        outcomes.Outcome(
+            name=case.name, status=status, sentence=sentence, key=key, values=numbers, seconds=spent
+        )
     )
 
 
@@ -486,11 +474,11 @@ class SweepSummary:
 
 
 def run_sweep(
-    store: Store,
+    store: outcomes.Store,
     processes: Processes,
     spec: Sweep,
-    progress: Progress = lambda done, total: None,
-    limit_s: float = LIMIT_S,
+    progress: outcomes.Progress = lambda done, total: None,
+    limit_s: float = outcomes.LIMIT_S,
 ) -> Counter[str]:
     """Run all cases that are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
     base, seed = spec.base, spec.draws.seed
@@ -500,14 +488,14 @@ def run_sweep(
         key = sha256(json.dumps([*whole, case.draw, case.values], sort_keys=True).encode())
         return Task(case.name, measured, (case, base, seed, key, store.known(case.name)), limit_s)
 
-    return run_all(store, processes, map(task, cases(spec)), spec.cases, "case", progress)
+    return outcomes.run_all(store, processes, map(task, cases(spec)), spec.cases, "case", progress)
 
 
 def _numeric(spec: Sweep, name: str) -> bool:
     return all(isinstance(value, float) for value in spec.axes.get(name, ()))
 
 
-def _table(store: Store, spec: Sweep) -> tuple[Any, tuple[str, ...]]:
+def _table(store: outcomes.Store, spec: Sweep) -> tuple[Any, tuple[str, ...]]:
     """All cases as an Arrow table, and the names of what was measured, the one that decides first."""
     numbers, times = {name: _numeric(spec, name) for name in spec.names}, list[tuple[int, float]]()
 
@@ -521,8 +509,8 @@ def _table(store: Store, spec: Sweep) -> tuple[Any, tuple[str, ...]]:
                 row["sentence"] = outcome.sentence
             yield row
 
-    whole = arrow_table(rows())
-    write_timings(store.out, "case,seconds", times)
+    whole = outcomes.arrow_table(rows())
+    outcomes.write_timings(store.out, "case,seconds", times)
     first = ("case", "point", "draw", *spec.names)
     found = [name for name in whole.column_names if name not in (*first, "sentence")]
     unknown = next((name for name in spec.measure if found and name not in found), None)
@@ -533,22 +521,24 @@ def _table(store: Store, spec: Sweep) -> tuple[Any, tuple[str, ...]]:
     measures = tuple(name for name in spec.measure or found if name in found)
     kinds = dict.fromkeys(first[:3], "int64") | {"sentence": "string"}
     kinds |= {name: "string" for name, one in numbers.items() if not one}
-    return typed(whole, [*first, *measures, "sentence"], kinds), measures
+    return outcomes.typed(whole, [*first, *measures, "sentence"], kinds), measures
 
 
-def summarise_sweep(store: Store, spec: Sweep, as_before: int) -> SweepSummary:
+def summarise_sweep(store: outcomes.Store, spec: Sweep, as_before: int) -> SweepSummary:
     """Write sweep.parquet and the timings, and return the summary.
 
     Raises `BadInputError` for a measure that there is not.
     """
     table, measures = _table(store, spec)
-    write_table(store.out / "sweep.parquet", table)
-    failed = [sentence for sentence in texts(table, "sentence") if sentence]
+    outcomes.write_table(store.out / "sweep.parquet", table)
+    failed = [sentence for sentence in outcomes.texts(table, "sentence") if sentence]
     deciding = measures[0] if measures else ""
-    y = column(table, deciding)
+    y = outcomes.column(table, deciding)
     points = _points(table, spec, y, measures)
     ranked = sorted((p for p in points if math.isfinite(p.loss)), key=lambda p: p.loss)
-    clouds = tuple((name, _cloud(column(table, name), y)) for name in spec.names if _numeric(spec, name))
+    clouds = tuple(
+        (name, _cloud(outcomes.column(table, name), y)) for name in spec.names if _numeric(spec, name)
+    )
     why = failed[0] if failed else ""
     best, worst = tuple(ranked[:_MOST_SHOWN]), tuple(reversed(ranked[_MOST_SHOWN:][-_MOST_SHOWN:]))
     return SweepSummary(spec.cases, len(failed), as_before, why, deciding, measures, best, worst, clouds)
@@ -557,10 +547,11 @@ def summarise_sweep(store: Store, spec: Sweep, as_before: int) -> SweepSummary:
 def _points(table: Any, spec: Sweep, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:
     """Points of the grid; the draws themselves where there is no grid."""
     by_point = bool(spec.grid)
-    group = column(table, "point" if by_point else "case").astype(np.int64)
-    others = {name: column(table, name) for name in measures}
+    group = outcomes.column(table, "point" if by_point else "case").astype(np.int64)
+    others = {name: outcomes.column(table, name) for name in measures}
     listed: dict[str, Any] = {
-        name: column(table, name) if _numeric(spec, name) else texts(table, name) for name in spec.names
+        name: outcomes.column(table, name) if _numeric(spec, name) else outcomes.texts(table, name)
+        for name in spec.names
     }
     shown = list(spec.grid) if by_point else list(spec.names)
     order = np.argsort(group, kind="stable")

@@ -11,34 +11,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.geometry import box_grid
 from calib.solve.information import scaled_inverse
-from calib.stages.camera.bundle import (
-    Calibration,
-    Minimum,
-    homographies,
-    joint_jacobian,
-    linearise,
-    minimise,
-    poses_from_homographies,
-    poses_with_camera,
-    refitted,
-    rotation_exp,
-)
-from calib.stages.camera.model import (
-    FISHEYE,
-    INTRINSICS,
-    Block,
-    Camera,
-    Observations,
-    ahead_radius,
-    camera_from_vector,
-    distorted_normalised,
-    fold_angle,
-    fold_radius,
-    one_to_one_reach,
-    project,
-    rays,
-    undistort,
-)
+from calib.stages.camera import bundle, model
 
 # ----------------------------------------------------------------------
 # Where views show the board, which of them show it where others do, and how far the lens is one-to-one.
@@ -98,7 +71,7 @@ def inside_hull(points: FloatArray, corners: FloatArray) -> BoolArray:
     return np.asarray(np.all(turn >= -1e-9, axis=1) | np.all(turn <= 1e-9, axis=1))
 
 
-def target_box(calibration: Calibration) -> FloatArray:
+def target_box(calibration: bundle.Calibration) -> FloatArray:
     """Corners (4, 3) of the box around all points of the target, on its plane."""
     observations = calibration.observations
     target = np.broadcast_to(observations.target_m, (*observations.pixels.shape[:2], 3))
@@ -116,7 +89,7 @@ def cell_of(
     return column, row
 
 
-def repeated_views(observations: Observations, width_px: int) -> IntArray:
+def repeated_views(observations: model.Observations, width_px: int) -> IntArray:
     """For each view the one that others show the board in the same place as, often itself, (N,).
 
     The same place: the points that both show, at least half of the poorer view's, are apart by no more than
@@ -160,7 +133,7 @@ def _same_place(apart: FloatArray, pixels: FloatArray, width_px: int) -> bool:
     return moved < float(np.clip(2 * noise, _SAME_PX, max(_SAME_SHARE * width_px, _SAME_PX)))
 
 
-def image_outline(camera: Camera) -> FloatArray:
+def image_outline(camera: model.Camera) -> FloatArray:
     """Pixels (n, 2) along the image's border, or nearer where only they show what is ahead.
 
     The corners of a fisheye lens's picture often show nothing.
@@ -173,31 +146,31 @@ def image_outline(camera: Camera) -> FloatArray:
     if not camera.fisheye:
         return border
     centre = camera.centre_px
-    radius = np.linalg.norm(distorted_normalised(camera, border), axis=1)
+    radius = np.linalg.norm(model.distorted_normalised(camera, border), axis=1)
     # Rounding must not put the last ones beside the camera.
-    share = np.minimum(1.0, (1.0 - 1e-9) * ahead_radius(camera) / radius)
+    share = np.minimum(1.0, (1.0 - 1e-9) * model.ahead_radius(camera) / radius)
     return np.asarray(centre + (border - centre) * share[:, None])
 
 
-def lens_shape(calibration: Calibration) -> Lens:
+def lens_shape(calibration: bundle.Calibration) -> Lens:
     """Whether the distortion is monotonic over the angles that were seen and over the image."""
     camera = calibration.camera
-    last = fold_angle(camera)[0] if camera.fisheye else np.arctan(fold_radius(camera)[0])
-    border = rays(camera, image_outline(camera))
+    last = model.fold_angle(camera)[0] if camera.fisheye else np.arctan(model.fold_radius(camera)[0])
+    border = model.rays(camera, image_outline(camera))
     return Lens(
         folds_among_points=bool(seen_angles(calibration).max() >= last),
         image_shown=float(np.isfinite(border).all(axis=1).mean()),
-        reach=one_to_one_reach(camera),
+        reach=model.one_to_one_reach(camera),
     )
 
 
-def seen_angles(calibration: Calibration) -> FloatArray:
+def seen_angles(calibration: bundle.Calibration) -> FloatArray:
     """Angles (n,) from the optical axis of all points, rad."""
     x, y, z = points_C(calibration).T
     return np.asarray(np.arctan2(np.hypot(x, y), z))
 
 
-def points_C(calibration: Calibration) -> FloatArray:
+def points_C(calibration: bundle.Calibration) -> FloatArray:
     """All points (n, 3) in the camera's frame, metres."""
     block, observations = calibration.block, calibration.observations
     every = observations.target_m @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
@@ -230,7 +203,7 @@ class Means:
     reach_px: float
 
 
-def cell_means(fit: Calibration, at: FloatArray, vectors: FloatArray, weights: FloatArray) -> Means:
+def cell_means(fit: bundle.Calibration, at: FloatArray, vectors: FloatArray, weights: FloatArray) -> Means:
     """Means over about 8 x 6 cells, with the weights of a robust loss where there is one."""
     width, height = fit.camera.image_size_px
     columns = 8 if width >= height else max(3, round(8 * width / height))
@@ -301,7 +274,7 @@ def _smooth(target_m: FloatArray, pixels: FloatArray, most_px: float) -> bool:
     return bool(abs(turns.mean()) > _ONE_SIDE and off.mean() < most_px**2)
 
 
-def view_faults(observations: Observations) -> list[str]:
+def view_faults(observations: model.Observations) -> list[str]:
     """Of each view the one of `FAULTS` that it has, or ""."""
     present, pixels = observations.present, observations.pixels
     target = np.broadcast_to(observations.target_m, (*present.shape, 3))
@@ -312,7 +285,7 @@ def view_faults(observations: Observations) -> list[str]:
     usable = np.flatnonzero(~few & ~line)
     if len(usable):
         chosen = observations.select(usable)
-        H = homographies(chosen)
+        H = bundle.homographies(chosen)
         plane = np.broadcast_to(chosen.target_m[..., :2], chosen.pixels.shape)
         mapped = np.einsum("nij,nmj->nmi", H[..., :2], plane) + H[:, None, :, 2]
         depth = np.where(np.abs(mapped[..., 2:]) > 1e-12, mapped[..., 2:], 1e-12)
@@ -378,7 +351,7 @@ def eliminated(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, Fl
 
 
 def evidence(
-    calibration: Calibration, basis: FloatArray | None = None, names: tuple[str, ...] = ()
+    calibration: bundle.Calibration, basis: FloatArray | None = None, names: tuple[str, ...] = ()
 ) -> Evidence:
     """Information of each view about the free intrinsics and, with `basis`, the target's deformation.
 
@@ -394,7 +367,9 @@ def evidence(
     """
     observations = calibration.shaped(calibration.observations)
     at_rest = replace(calibration.block, deformation=np.zeros(0 if basis is None else basis.shape[-3]))
-    at = linearise(at_rest, observations, calibration.free, basis, calibration.loss, calibration.scale_px)
+    at = bundle.linearise(
+        at_rest, observations, calibration.free, basis, calibration.loss, calibration.scale_px
+    )
     if at is None:
         raise ValueError("the calibration has points behind the camera")
     S, b = eliminated(at.normal, at.gradient)
@@ -427,9 +402,9 @@ class Skew:
     shear_chi2: float
 
 
-def skew_left_out(calibration: Calibration) -> Skew:
+def skew_left_out(calibration: bundle.Calibration) -> Skew:
     """The skew that a calibration without one would have."""
-    free = np.sort(np.append(calibration.free, INTRINSICS.index("skew_px")))
+    free = np.sort(np.append(calibration.free, model.INTRINSICS.index("skew_px")))
     freed = replace(calibration, free=free)
     found = evidence(freed)
     S, b = found.S.sum(axis=0), found.b.sum(axis=0)
@@ -472,12 +447,12 @@ _TOLD = 1e-3
 """What a view tells of a direction, over what all views do, below which it is silent there."""
 
 
-def alone_px(calibration: Calibration) -> float:
+def alone_px(calibration: bundle.Calibration) -> float:
     """Standard deviation of a coordinate if every view had a camera of its own, its skew included.
 
     One step of each view's parameters, in the directions of which it tells anything.
     """
-    free = np.union1d(calibration.free, [INTRINSICS.index("skew_px")])
+    free = np.union1d(calibration.free, [model.INTRINSICS.index("skew_px")])
     found = evidence(replace(calibration, free=free))
     values, vectors = np.linalg.eigh(scaled_inverse(found.S.sum(axis=0)))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -537,7 +512,7 @@ class TargetShape:
         return bool(np.any(np.abs(self.values) > _CERTAIN * self.sigma))
 
 
-def _basis(calibration: Calibration) -> tuple[FloatArray, float]:
+def _basis(calibration: bundle.Calibration) -> tuple[FloatArray, float]:
     """Displacements (5, 3, M) or (N, 5, 3, M) of the points, and half the target's longer side."""
     target, box = calibration.observations.target_m, target_box(calibration)
     low, high = box[0, :2], box[2, :2]
@@ -552,7 +527,7 @@ def _basis(calibration: Calibration) -> tuple[FloatArray, float]:
     return basis[0] if len(basis) == 1 else basis, half
 
 
-def target_shape(calibration: Calibration) -> TargetShape | None:
+def target_shape(calibration: bundle.Calibration) -> TargetShape | None:
     """Deformation of the target; None where the data are too few to say."""
     if calibration.degrees_of_freedom <= 2 * len(DEFORMATIONS):
         return None
@@ -587,7 +562,7 @@ def target_shape(calibration: Calibration) -> TargetShape | None:
     )
 
 
-def drift(calibration: Calibration) -> FloatArray | None:
+def drift(calibration: bundle.Calibration) -> FloatArray | None:
     """RMS change (P,) of the intrinsics about their mean, where they run evenly from view to view; else None.
 
     As of a lens that warms up, or one refocused by too little to tell two cameras apart. The target keeps one
@@ -633,22 +608,22 @@ _NEARLY = 1.02
 """Cost of five coefficients over that of the rational model below which they do."""
 
 
-def conditioned(calibration: Calibration) -> Calibration:
+def conditioned(calibration: bundle.Calibration) -> bundle.Calibration:
     """The same views without the freedom of the rational model's denominator; other models as they are.
 
     The denominator trades with the numerator at next to no cost, so that what it leaves undetermined
     says nothing about the camera. Where five coefficients do nearly as well they take its place, else
     the denominator is held at its values.
     """
-    loose = [INTRINSICS.index(name) for name in ("k4", "k5", "k6")]
+    loose = [model.INTRINSICS.index(name) for name in ("k4", "k5", "k6")]
     kept = np.flatnonzero(~np.isin(calibration.free, loose))
     if calibration.camera.fisheye or len(kept) == len(calibration.free):
         return calibration
     if all(name in calibration.free_names for name in ("k1", "k2", "p1", "p2", "k3")):
         intrinsics = calibration.block.intrinsics.copy()
-        intrinsics[INTRINSICS.index("k1") :] = 0.0
+        intrinsics[model.INTRINSICS.index("k1") :] = 0.0
         start = replace(calibration.block, intrinsics=intrinsics)
-        simpler = refitted(calibration, model="brown5", start=start, max_iterations=_MAX_ITERATIONS)
+        simpler = bundle.refitted(calibration, model="brown5", start=start, max_iterations=_MAX_ITERATIONS)
         if simpler.converged and simpler.squared_sum < _NEARLY * calibration.squared_sum:
             return simpler
     rows = np.concatenate([kept, np.arange(len(calibration.free), calibration.normal.shape[1])])
@@ -656,7 +631,7 @@ def conditioned(calibration: Calibration) -> Calibration:
     return replace(calibration, free=calibration.free[kept], normal=normal)
 
 
-def other_starts(calibration: Calibration) -> list[tuple[float, Minimum]]:
+def other_starts(calibration: bundle.Calibration) -> list[tuple[float, bundle.Minimum]]:
     """Focal lengths of starts, and where they ended.
 
     They go from 0.4 to 4 image widths, of a fisheye lens from 0.2 to 0.8, with principal points about the
@@ -665,8 +640,8 @@ def other_starts(calibration: Calibration) -> list[tuple[float, Minimum]]:
     rng = np.random.default_rng(0)
     observations, camera = calibration.observations, calibration.camera
     width, height = camera.image_size_px
-    H = homographies(observations)
-    free, begun = calibration.free, np.zeros(len(INTRINSICS))
+    H = bundle.homographies(observations)
+    free, begun = calibration.free, np.zeros(len(model.INTRINSICS))
     ends = []
     for share in FISHEYE_STARTS if camera.fisheye else FOCAL_STARTS:
         focal = share * max(width, height)
@@ -674,19 +649,19 @@ def other_starts(calibration: Calibration) -> list[tuple[float, Minimum]]:
         begun[:4] = focal, focal, 0.5 * (width - 1) + jitter[0], 0.5 * (height - 1) + jitter[1]
         guess = calibration.block.intrinsics.copy()
         guess[free] = begun[free]
-        begin = camera_from_vector(camera.model, camera.image_size_px, guess)
+        begin = model.camera_from_vector(camera.model, camera.image_size_px, guess)
         if camera.fisheye:
-            start = poses_with_camera(begin, observations)
+            start = bundle.poses_with_camera(begin, observations)
         else:
-            start = Block.of(begin, *poses_from_homographies(begin.K, H))
+            start = model.Block.of(begin, *bundle.poses_from_homographies(begin.K, H))
         if start.posed.all():
-            found = minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
+            found = bundle.minimise(start, observations, free, max_iterations=_MAX_ITERATIONS)
             if found.at is not None:
                 ends.append((focal, found))
     return ends
 
 
-def best_of_starts(calibration: Calibration) -> Calibration:
+def best_of_starts(calibration: bundle.Calibration) -> bundle.Calibration:
     """The calibration, or the one that another start leads to if its cost is lower by more than chance.
 
     More than chance: by more than 3.84 times the residuals' variance. Above 60 views the starts are
@@ -715,15 +690,15 @@ def best_of_starts(calibration: Calibration) -> Calibration:
         return calibration
     camera, start = calibration.camera, best.block
     if some is not calibration:
-        found = camera_from_vector(camera.model, camera.image_size_px, start.intrinsics)
-        start = poses_with_camera(found, calibration.observations)
+        found = model.camera_from_vector(camera.model, camera.image_size_px, start.intrinsics)
+        start = bundle.poses_with_camera(found, calibration.observations)
         if not start.posed.all():
             return calibration
-    better = refitted(calibration, start=start)
+    better = bundle.refitted(calibration, start=start)
     return better if _cost(better) < _cost(calibration) - CHI2_95 * better.sigma_px**2 else calibration
 
 
-def _cost(calibration: Calibration) -> float:
+def _cost(calibration: bundle.Calibration) -> float:
     """Sum of squared residuals, infinite where the fit has none."""
     return calibration.squared_sum if np.all(np.isfinite(calibration.normal)) else float("inf")
 
@@ -803,23 +778,23 @@ class Split:
         return bool(np.array_equal(self.second, np.sort(self.second)))
 
 
-def widened(calibration: Calibration) -> Calibration:
+def widened(calibration: bundle.Calibration) -> bundle.Calibration:
     """The same views with k1, k2, p1, p2 and k3 free, where the model is poorer and that helps."""
-    if calibration.camera.model in ("brown5", "rational8", FISHEYE):
+    if calibration.camera.model in ("brown5", "rational8", model.FISHEYE):
         return calibration
-    rich = refitted(calibration, model="brown5", max_iterations=_TWO_CAMERAS_MAX_ITERATIONS)
+    rich = bundle.refitted(calibration, model="brown5", max_iterations=_TWO_CAMERAS_MAX_ITERATIONS)
     # Coefficients that explain nothing only blur the difference of two cameras.
     worth = _WORTH * (len(rich.free) - len(calibration.free)) * calibration.sigma_px**2
     return rich if rich.squared_sum < calibration.squared_sum - worth else calibration
 
 
-def straightened(calibration: Calibration, displacement_m: FloatArray) -> Calibration:
+def straightened(calibration: bundle.Calibration, displacement_m: FloatArray) -> bundle.Calibration:
     """The same views of a target whose points are moved by `displacement_m` (1 or N, M, 3).
 
     A target that would then lie behind the camera tells nothing; the calibration is left as it is.
     """
     straight = calibration.observations.displaced(displacement_m)
-    moved = refitted(calibration, observations=straight, max_iterations=_TWO_CAMERAS_MAX_ITERATIONS)
+    moved = bundle.refitted(calibration, observations=straight, max_iterations=_TWO_CAMERAS_MAX_ITERATIONS)
     return calibration if moved.termination == "behind the camera" else moved
 
 
@@ -879,7 +854,7 @@ def _statistic(problem: _Problem, second: BoolArray) -> tuple[FloatArray, FloatA
     return fall / (variance * np.maximum(phi2, 1.0)), fall, phi2
 
 
-def _problem(found: Evidence, calibration: Calibration) -> tuple[_Problem, FloatArray]:
+def _problem(found: Evidence, calibration: bundle.Calibration) -> tuple[_Problem, FloatArray]:
     focal, longest = calibration.camera.fx_px, max(calibration.camera.image_size_px)
     width = {"cx_px": longest, "cy_px": longest}
     scale = np.array(
@@ -934,7 +909,7 @@ def _sturdy(problem: _Problem, search: Callable[[_Problem], FloatArray]) -> Floa
 
 
 def _described(
-    problem: _Problem, scale: FloatArray, calibration: Calibration, second: BoolArray, ratio: float
+    problem: _Problem, scale: FloatArray, calibration: bundle.Calibration, second: BoolArray, ratio: float
 ) -> Split:
     _, fall, phi2 = (float(value[0]) for value in _statistic(problem, second[None]))
     S, _, d = _groups(problem, second[None])
@@ -956,10 +931,10 @@ def _described(
     )
 
 
-def apart_px(calibration: Calibration, difference: FloatArray) -> float:
+def apart_px(calibration: bundle.Calibration, difference: FloatArray) -> float:
     """Root mean square change of the pixels seen by a change of the free intrinsics, and the best turn."""
     used = points_C(calibration)
-    J = joint_jacobian(calibration, used[:: max(1, len(used) // 500)])
+    J = bundle.joint_jacobian(calibration, used[:: max(1, len(used) // 500)])
     P = len(difference)
     moved, turned = (J[..., :P] @ difference).ravel(), J[..., P : P + 3].reshape(-1, 3)
     left = moved - turned @ np.linalg.lstsq(turned, moved, rcond=None)[0]
@@ -977,7 +952,7 @@ def _without(problem: _Problem, odd: IntArray) -> _Problem:
     return _Problem(S, b - S @ (inverse @ whole), cost, problem.freedom)
 
 
-def best_split(calibration: Calibration) -> Split | None:
+def best_split(calibration: bundle.Calibration) -> Split | None:
     """The two groups of views that differ most, or None below eight views.
 
     Parameters
@@ -1066,7 +1041,7 @@ class Plan:
     """
 
     candidates: tuple[Candidate, ...]
-    calibration: Calibration
+    calibration: bundle.Calibration
     target_m: FloatArray
     information: FloatArray
     reference: FloatArray
@@ -1095,10 +1070,10 @@ def tilted(tilt_deg: float, away: str) -> FloatArray:
     """Rotation (3, 3) of a board whose edge `away` in the picture leans away from the camera."""
     azimuth = np.radians(_EDGES.get(away, 0.0))
     axis = np.array([[np.sin(azimuth), -np.cos(azimuth), 0.0]])
-    return np.asarray(rotation_exp(np.radians(tilt_deg) * axis)[0])
+    return np.asarray(bundle.rotation_exp(np.radians(tilt_deg) * axis)[0])
 
 
-def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | None:
+def best_next_view(calibration: bundle.Calibration, information: FloatArray) -> Plan | None:
     """Of about a hundred poses of the board those that fit into the picture, the most useful first.
 
     A pose that a view has is left out unless there is no other: the same picture once more lowers sigma on
@@ -1119,7 +1094,7 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | 
     kinds: list[tuple[str, float, str, float]] = []
     for row, v in enumerate(_PLACES):
         for column, u in enumerate(_PLACES):
-            ray = undistort(camera, np.array([u * (width - 1), v * (height - 1)]))
+            ray = model.undistort(camera, np.array([u * (width - 1), v * (height - 1)]))
             if not np.all(np.isfinite(ray)):
                 continue
             for span in (0.35, 0.6):
@@ -1134,7 +1109,7 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | 
     R, t = np.array(rotations), np.array(translations)
     points = target @ R.transpose(0, 2, 1) + t[:, None]
     ahead = points[..., 2].min(axis=1) > 0.05 * diagonal
-    pixels = project(camera, np.where(ahead[:, None, None], points, [0.0, 0.0, 1.0]))
+    pixels = model.project(camera, np.where(ahead[:, None, None], points, [0.0, 0.0, 1.0]))
     inside = ((pixels > 0) & (pixels < [width - 1, height - 1])).all(axis=(1, 2))
     # A view half outside of the picture is no advice, except where no other fits.
     kept = np.flatnonzero(ahead & inside & np.isfinite(pixels).all(axis=(1, 2)))
@@ -1154,14 +1129,14 @@ def best_next_view(calibration: Calibration, information: FloatArray) -> Plan | 
     return Plan(candidates, calibration, target, information, reference)
 
 
-def _repeats(calibration: Calibration, target: FloatArray, pixels: FloatArray) -> BoolArray:
+def _repeats(calibration: bundle.Calibration, target: FloatArray, pixels: FloatArray) -> BoolArray:
     """Which views (n, M, 2) show the points (M, 3) of the target where a view of the calibration does.
 
     A target that is turned by half counts as the same.
     """
     block, camera = calibration.block, calibration.camera
     points = target @ block.R_CT.transpose(0, 2, 1) + block.t_CT_m[:, None]
-    seen = project(camera, np.concatenate([points, points[:, ::-1]]))
+    seen = model.project(camera, np.concatenate([points, points[:, ::-1]]))
     squared = ((pixels[:, None] - seen) ** 2).sum(axis=-1).mean(axis=-1)
     return np.asarray((squared < (_NEW_SHARE * camera.image_size_px[0]) ** 2).any(axis=1))
 
@@ -1176,12 +1151,12 @@ def _remaining(information: FloatArray, reference: FloatArray, S: FloatArray) ->
 
 
 def _information(
-    calibration: Calibration, target: FloatArray, R: FloatArray, t: FloatArray
+    calibration: bundle.Calibration, target: FloatArray, R: FloatArray, t: FloatArray
 ) -> FloatArray | None:
     """Information (n, G, G) of made-up views of the target about the intrinsics."""
     M = len(target)
-    made = Observations.of(target, np.zeros((len(R), M, 2)))
-    at = linearise(Block.of(calibration.camera, R, t), made, calibration.free, None)
+    made = model.Observations.of(target, np.zeros((len(R), M, 2)))
+    at = bundle.linearise(model.Block.of(calibration.camera, R, t), made, calibration.free, None)
     if at is None:
         return None
     # As many points as the target has in a view, spread as they are.

@@ -16,6 +16,7 @@ from calib.core.verdict import Finding, Verdict
 from calib.core.workers import Workers
 from calib.solve.chance import tail_of_t
 from calib.solve.information import scaled_inverse
+from calib.stages.camera import checks
 from calib.stages.camera.bundle import (
     Calibration,
     Covariance,
@@ -25,24 +26,6 @@ from calib.stages.camera.bundle import (
     projection_sigma_px,
     refit_poses,
     refitted,
-)
-from calib.stages.camera.checks import (
-    FAULTS,
-    TargetShape,
-    alone_px,
-    apart_px,
-    best_of_starts,
-    drift,
-    evidence,
-    image_outline,
-    lens_shape,
-    overdispersion,
-    repeated_views,
-    seen_angles,
-    skew_left_out,
-    straightened,
-    target_shape,
-    view_faults,
 )
 from calib.stages.camera.model import (
     FISHEYE,
@@ -226,7 +209,7 @@ def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
 
 def _by_evidence(fit: Calibration, folds: Sequence[IntArray]) -> FloatArray:
     """The same (N,) to second order about the fit to all views."""
-    found = evidence(fit, fit.basis)
+    found = checks.evidence(fit, fit.basis)
     squared = np.empty(len(found.cost))
     for fold in folds:
         kept = np.setdiff1d(np.arange(len(squared)), fold)
@@ -255,10 +238,10 @@ def _on_fold(fits: Sequence[Calibration], job: tuple[int, IntArray]) -> FloatArr
 
 def _soundness(fit: Calibration) -> int:
     """`Candidate.soundness` of a lens."""
-    shape = lens_shape(fit)
+    shape = checks.lens_shape(fit)
     if not shape.one_to_one:
         return int(not shape.folds_among_points)
-    border = projection_sigma_px(fit, covariance(fit), image_outline(fit.camera))
+    border = projection_sigma_px(fit, covariance(fit), checks.image_outline(fit.camera))
     return _SOUND if np.all(border < _BORDER_SHARE * max(fit.camera.image_size_px)) else 2
 
 
@@ -306,8 +289,8 @@ def _wide(fit: Calibration) -> bool:
 
     The rational model folds by noise alone.
     """
-    folds = fit.camera.model != "rational8" and lens_shape(fit).folds_among_points
-    return bool(seen_angles(fit).max() > _WIDE) or folds
+    folds = fit.camera.model != "rational8" and checks.lens_shape(fit).folds_among_points
+    return bool(checks.seen_angles(fit).max() > _WIDE) or folds
 
 
 def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
@@ -316,7 +299,7 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
     Its cost has many minima. A simpler model that folds leads into a wrong one, and noise alone makes some
     with a pole in the picture, next to a zero that hides it.
     """
-    sound = [lens_shape(one).one_to_one for one in (*simpler, fit)]
+    sound = [checks.lens_shape(one).one_to_one for one in (*simpler, fit)]
     if not fit.rms_px < _LESS * min(
         (one.rms_px for one, good in zip(simpler, sound, strict=False) if good), default=np.inf
     ):
@@ -332,7 +315,9 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
     fits = [fit, *(fitted(start=start) for start in starts)]
     fits = [one for one in fits if np.isfinite(one.rms_px)]
     least = min(one.rms_px for one in fits)
-    return min(fits, key=lambda one: (one.rms_px > _SAME * least, not lens_shape(one).one_to_one, one.rms_px))
+    return min(
+        fits, key=lambda one: (one.rms_px > _SAME * least, not checks.lens_shape(one).one_to_one, one.rms_px)
+    )
 
 
 def candidates_by_board(rigid: Calibration) -> list[tuple[Candidate, Calibration]]:
@@ -463,8 +448,8 @@ def _usable(views: Sequence[View], choices: Choices) -> tuple[Observations, list
     if not views:
         raise BadInputError("there are no views to calibrate from")
     everything = pack(views)
-    faults = view_faults(everything)
-    for allowed in ("", FAULTS[-1]):
+    faults = checks.view_faults(everything)
+    for allowed in ("", checks.FAULTS[-1]):
         kept = [i for i, fault in enumerate(faults) if fault in ("", allowed)]
         if kept:
             break
@@ -520,7 +505,7 @@ def _chosen_model(
 
 def _skewed(fit: Calibration) -> bool:
     """Whether the views show a skew that a fit without one leaves out, and that matters."""
-    found = skew_left_out(fit)
+    found = checks.skew_left_out(fit)
     return (
         abs(found.skew_px) > _SKEW_SIGMAS * found.sigma_px
         and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px)
@@ -600,7 +585,7 @@ def calibrate_camera(
     verdict = _judged(fit, findings)
     if shared and verdict.word in ("ok", "poor"):
         verdict = _judged(fit, [*findings, *shared])
-    if verdict.word == "unidentifiable" and (better := best_of_starts(fit)) is not fit:
+    if verdict.word == "unidentifiable" and (better := checks.best_of_starts(fit)) is not fit:
         fit, sigma = better, _by_the_views(better)
         verdict = _judged(fit, findings)
     judged = time.perf_counter()
@@ -615,7 +600,7 @@ def without_copies(
 
     Of the views with most points that is the one with the least residuals of a rough fit, or else the first.
     """
-    first = repeated_views(observations, max(image_size_px))
+    first = checks.repeated_views(observations, max(image_size_px))
     if len(np.unique(first)) == len(first):
         return observations, []
     fit = calibrate(observations, image_size_px, _ROUGH, **_ROUGHLY)
@@ -632,10 +617,10 @@ def without_copies(
     return observations.select(sorted(own.values())), copies
 
 
-def _shape(fit: Calibration) -> TargetShape | None:
+def _shape(fit: Calibration) -> checks.TargetShape | None:
     """The board's shape where it is certainly another than the one described."""
     try:
-        shape = target_shape(fit) if np.all(np.isfinite(fit.normal)) else None
+        shape = checks.target_shape(fit) if np.all(np.isfinite(fit.normal)) else None
     except (np.linalg.LinAlgError, ValueError):
         return None
     return shape if shape is not None and shape.certain else None
@@ -648,7 +633,7 @@ def _on_its_board(fit: Calibration) -> Calibration:
     was turned does.
     """
     shape = _shape(fit)
-    return fit if shape is None else straightened(fit, shape.displacement_m)
+    return fit if shape is None else checks.straightened(fit, shape.displacement_m)
 
 
 def _screened(fit: Calibration) -> Triage:
@@ -657,7 +642,7 @@ def _screened(fit: Calibration) -> Triage:
     everything, gone = fit.observations, {one.name for one in found.left_out if one.kind == "view"}
     for source in (fit, found.calibration) if gone else ():
         shape = _shape(source)
-        other = None if shape is None else triage(straightened(fit, shape.displacement_m))
+        other = None if shape is None else triage(checks.straightened(fit, shape.displacement_m))
         leaving = {one.name for one in other.left_out if one.kind == "view"} if other else gone
         if other is None or len(leaving) >= len(gone):
             continue
@@ -675,14 +660,14 @@ def _alone_odd(found: Triage) -> bool:
     Where those few differ by much, views that agree may seem to share a second camera with them.
     """
     views, rest = sum(one.kind == "view" for one in found.left_out), found.calibration
-    return views <= _FEW_ODD and rest.sigma_px < Limits.change_times * alone_px(_on_its_board(rest))
+    return views <= _FEW_ODD and rest.sigma_px < Limits.change_times * checks.alone_px(_on_its_board(rest))
 
 
 def _moved_px(found: Triage) -> float:
     """By how much all views and those that agree put directions apart, over `scale_of` the camera."""
     every, some = found.everything, found.calibration
     difference = (every.block.intrinsics - some.block.intrinsics)[some.free]
-    return apart_px(some, difference) / scale_of(some.camera.image_size_px)
+    return checks.apart_px(some, difference) / scale_of(some.camera.image_size_px)
 
 
 def _sorted_out(
@@ -746,9 +731,9 @@ def _by_the_views(fit: Calibration) -> Covariance:
     changes from view to view is another by as much.
     """
     try:
-        inflation = overdispersion(evidence(fit, fit.basis))
+        inflation = checks.overdispersion(checks.evidence(fit, fit.basis))
         tells = fit.basis is None and fit.observations.views >= _TELL_SHAPE
-        shape, ran = (_shape(fit), drift(fit)) if tells else (None, None)
+        shape, ran = (_shape(fit), checks.drift(fit)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
         inflation, shape, ran = 1.0, None, None
     known = covariance(fit, (inflation * fit.sigma_px) ** 2)

@@ -9,16 +9,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from calib.core import geometry
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import (
-    Homography,
-    apply_homography,
-    box_grid,
-    fit_homography,
-    in_picture,
-    map_jacobian,
-)
 from calib.core.verdict import Finding, Verdict
 from calib.solve.chance import tail_of_f
 from calib.stages.camera.model import INTRINSICS, Board, Camera, View, project, undistort
@@ -79,7 +72,7 @@ class PositionSigma:
 def visible(camera: Camera, R_CW: FloatArray, t_CW_m: FloatArray, points_m: FloatArray) -> BoolArray:
     """Which places (N, 2) of the plane the picture shows, (N,): in front, inside, and not folded over."""
     pixels = plane_pixels(camera, R_CW, t_CW_m, points_m)
-    shown = in_picture(pixels, camera.image_size_px)
+    shown = geometry.in_picture(pixels, camera.image_size_px)
     back = plane_map(camera, R_CW, t_CW_m, pixels[shown])
     shown[shown] = np.linalg.norm(back - points_m[shown], axis=1) < 1e-6 * np.linalg.norm(t_CW_m)
     return shown
@@ -306,13 +299,13 @@ def _of_residuals(camera: Camera, plane: Plane, camera_rms_px: float | None) -> 
     usable = bool(np.isfinite(ideal).all())
     free_rms = plain_rms = off_mm = math.nan
     if usable and len(pixels) >= _HOMOGRAPHY_POINTS and rms > _STRAIGHT_PX:
-        free = fit_homography(world_m, ideal)
+        free = geometry.fit_homography(world_m, ideal)
         seen = project(camera, np.column_stack([world_m, np.ones(len(world_m))]) @ free.H.T)
         free_rms = float(np.sqrt(np.mean(np.sum((seen - pixels) ** 2, axis=1))))
         posed = plane_map(camera, plane.R_CW, plane.t_CW_m, pixels)
-        freed = apply_homography(np.asarray(np.linalg.inv(free.H)), ideal)
+        freed = geometry.apply_homography(np.asarray(np.linalg.inv(free.H)), ideal)
         off_mm = 1e3 * float(np.linalg.norm(posed - freed, axis=1).max())
-        plain_rms = fit_homography(world_m, pixels).rms_px
+        plain_rms = geometry.fit_homography(world_m, pixels).rms_px
     if _HOMOGRAPHY_FACTOR * plain_rms < min(free_rms, rms):
         yield Finding(
             "poor",
@@ -435,7 +428,7 @@ def _of_horizon(camera: Camera, plane: Plane) -> Iterator[Finding]:
     if camera.fisheye:
         return
     width, height = camera.image_size_px
-    ideal = undistort(camera, box_grid((0.0, 0.0, width - 1.0, height - 1.0), 41, 31).reshape(-1, 2))
+    ideal = undistort(camera, geometry.box_grid((0.0, 0.0, width - 1.0, height - 1.0), 41, 31).reshape(-1, 2))
     ideal = ideal[np.isfinite(ideal).all(axis=1)]
     last = np.linalg.inv(np.column_stack([plane.R_CW[:, :2], plane.t_CW_m]))[2]
     beyond = float(np.mean(ideal @ last[:2] + last[2] <= 0.0)) if len(ideal) else 0.0
@@ -520,7 +513,7 @@ class Plane(Pose):
     corners_px: FloatArray
     workspace_m: tuple[float, float, float, float]
     sigma: PositionSigma
-    direct: Homography
+    direct: geometry.Homography
     direct_difference_mm: FloatArray
     verdict: Verdict
 
@@ -595,8 +588,8 @@ def calibrate_plane(
     if box is None:
         low, high = world_m.min(axis=0), world_m.max(axis=0)
         box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    sigma = position_sigma(camera, camera_covariance, pose, box_grid(box, 9, 9).reshape(-1, 2))
-    direct = fit_homography(world_m, pixels)
+    sigma = position_sigma(camera, camera_covariance, pose, geometry.box_grid(box, 9, 9).reshape(-1, 2))
+    direct = geometry.fit_homography(world_m, pixels)
     read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)
     whole = replace(pose, covariance=_pose_covariance(pose, camera_covariance))
     plane = Plane(
@@ -630,12 +623,12 @@ def _same_points(world_m: FloatArray) -> IntArray:
     return np.unique(keys, axis=0, return_inverse=True)[1].ravel()
 
 
-def moved_m(camera: Camera, pose: Pose, direct: Homography, points_m: FloatArray) -> FloatArray:
+def moved_m(camera: Camera, pose: Pose, direct: geometry.Homography, points_m: FloatArray) -> FloatArray:
     """How far the map without a lens moves the marker at each of places (..., 2); NaN out of sight."""
     seen = visible(camera, pose.R_CW, pose.t_CW_m, points_m.reshape(-1, 2)).reshape(points_m.shape[:-1])
     moved = np.full(points_m.shape, np.nan)
     pixels = plane_pixels(camera, pose.R_CW, pose.t_CW_m, points_m[seen])
-    moved[seen] = apply_homography(np.asarray(np.linalg.inv(direct.H)), pixels) - points_m[seen]
+    moved[seen] = geometry.apply_homography(np.asarray(np.linalg.inv(direct.H)), pixels) - points_m[seen]
     return moved
 
 
@@ -707,9 +700,9 @@ def turns_of(pixels: FloatArray, board: Board) -> list[tuple[int, FloatArray]]:
 def _world_x_direction(pixels: FloatArray, board: Board, angle_rad: float) -> float:
     """Direction (rad) of the world's x axis in the picture at the board's centre."""
     points = board.points_m()
-    H = fit_homography(points, pixels).H
+    H = geometry.fit_homography(points, pixels).H
     along_board = np.array([np.cos(angle_rad), -np.sin(angle_rad)])
-    du, dv = map_jacobian(H, points.mean(axis=0)) @ along_board
+    du, dv = geometry.map_jacobian(H, points.mean(axis=0)) @ along_board
     return float(np.arctan2(dv, du))
 
 

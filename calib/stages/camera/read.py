@@ -23,21 +23,11 @@ from calib.core.units import plain_number
 from calib.core.workers import Workers
 from calib.io.frames import Frames, is_recording, read_frames
 from calib.io.pictures import Picture, holds_pictures, list_pictures, read_picture, usual_size
+from calib.stages.camera import targets
 from calib.stages.camera.choice import most_informative
 from calib.stages.camera.corners import Detection, between_fields, detect, find_size
 from calib.stages.camera.model import Board, LeftOut, View
 from calib.stages.camera.options import Told
-from calib.stages.camera.targets import (
-    DICTIONARIES,
-    Layout,
-    detect_charuco,
-    find_markers,
-    in_place,
-    is_mirrored,
-    name_of,
-    recognise,
-    with_rows,
-)
 
 # ----------------------------------------------------------------------
 # board.yaml, and the search for its board in a set of pictures.
@@ -97,8 +87,8 @@ def known_dictionary(text: str, where: str, error: type[CalibError] = BadInputEr
     Raises `error`, naming `where` it stands.
     """
     name = text.strip().upper().removeprefix("DICT_")
-    if name not in DICTIONARIES:
-        nearest = get_close_matches(text.upper(), DICTIONARIES, 1, 0.0)[0]
+    if name not in targets.DICTIONARIES:
+        nearest = get_close_matches(text.upper(), targets.DICTIONARIES, 1, 0.0)[0]
         raise error(
             f"{where}: {one_line(text)[:40]!r} is no dictionary of markers, expected one of OpenCV's, "
             f"as {nearest}"
@@ -175,7 +165,7 @@ class BoardSearch:
     views: tuple[View, ...]
     left_out: tuple[LeftOut, ...]
     hashes: dict[str, str]
-    layout: Layout | None = None
+    layout: targets.Layout | None = None
 
 
 def find_boards(
@@ -340,7 +330,7 @@ class _Search:
             layout = self._layout(sample, None)
             if layout is not None:
                 return self._with_markers(corners, layout, layout.dictionary)
-            other_target = self._asked(name_of, sample)
+            other_target = self._asked(targets.name_of, sample)
             if other_target is not None:
                 raise BadInputError(f"{_names(pictures)}: {_shows(pictures)} {other_target}; {_READS}")
             wanted = wanted or self._common_size(range(count))
@@ -355,7 +345,7 @@ class _Search:
         return self._search(Board(*wanted, self.square_m), found, None)
 
     def _search(
-        self, board: Board, found: Mapping[int, Detection | None], layout: Layout | None
+        self, board: Board, found: Mapping[int, Detection | None], layout: targets.Layout | None
     ) -> BoardSearch:
         what = "ChArUco board" if layout else "board"
         why = f"shows no {what} with {board.columns}x{board.rows} inner corners that can be read"
@@ -363,7 +353,9 @@ class _Search:
         seen = [(picture, detection) for i, picture in enumerate(self.pictures) if (detection := found[i])]
         unread = [i for i, detection in found.items() if layout and not detection and i not in self.damaged]
         mirrored = dict(
-            zip(unread, self._each([(is_mirrored, i, (layout,)) for i in unread], unread), strict=True)
+            zip(
+                unread, self._each([(targets.is_mirrored, i, (layout,)) for i in unread], unread), strict=True
+            )
         )
         flipped = f"shows the {what} mirrored, as a selfie camera stores it: flip it back"
         return BoardSearch(
@@ -394,17 +386,17 @@ class _Search:
             return None
         return seen
 
-    def _layout(self, sample: Sequence[int], dictionary: str | None) -> Layout | None:
+    def _layout(self, sample: Sequence[int], dictionary: str | None) -> targets.Layout | None:
         """What board of markers the sample shows; of a stated dictionary, what any of the pictures does."""
         every = range(len(self.pictures))
         for which in (sample, every) if dictionary else (sample,):
-            layout: Layout | None = self._asked(recognise, which, dictionary)
+            layout: targets.Layout | None = self._asked(targets.recognise, which, dictionary)
             if layout is not None:
                 return layout
         return None
 
     def _with_markers(
-        self, corners: tuple[int, int] | None, layout: Layout | None, dictionary: str
+        self, corners: tuple[int, int] | None, layout: targets.Layout | None, dictionary: str
     ) -> BoardSearch:
         pictures, every = self.pictures, range(len(self.pictures))
         if layout is None:
@@ -417,15 +409,15 @@ class _Search:
                 f"{_names(pictures)}: {_shows(pictures)} a grid of {layout.dictionary} markers, "
                 f"{layout.columns}x{layout.rows}; {_READS}"
             )
-        seen = self._each([(find_markers, i, (layout.dictionary,)) for i in every], every)
+        seen = self._each([(targets.find_markers, i, (layout.dictionary,)) for i in every], every)
         markers = {i: one for i, one in zip(every, seen, strict=True) if one is not None}
-        kept = [in_place(one, layout)[0].ids for one in markers.values()]
-        layout = with_rows(layout, kept) or layout
+        kept = [targets.in_place(one, layout)[0].ids for one in markers.values()]
+        layout = targets.with_rows(layout, kept) or layout
         if corners is not None:
             layout = self._as_stated(corners, layout)
         board = Board(layout.columns - 1, layout.rows - 1, self.square_m)
         found = dict.fromkeys(every) | self._counted(
-            list(markers), [(detect_charuco, i, (one, layout)) for i, one in markers.items()]
+            list(markers), [(targets.detect_charuco, i, (one, layout)) for i, one in markers.items()]
         )
         if not any(found.values()):
             raise BadInputError(
@@ -434,7 +426,7 @@ class _Search:
             )
         return self._search(board, found, layout)
 
-    def _as_stated(self, corners: tuple[int, int], layout: Layout) -> Layout:
+    def _as_stated(self, corners: tuple[int, int], layout: targets.Layout) -> targets.Layout:
         """The layout with as many rows as stated, of which some may never have been seen."""
         columns, rows = layout.columns - 1, layout.rows - 1
         stated = next((c for c in (corners, corners[::-1]) if c[0] == columns and c[1] >= rows), None)
@@ -976,7 +968,7 @@ def _no_pictures(sources: Sequence[Path]) -> list[LeftOut]:
     ]
 
 
-def _of_markers(layout: Layout) -> str:
+def _of_markers(layout: targets.Layout) -> str:
     text = (
         f"found a ChArUco board with {layout.columns - 1}x{layout.rows - 1} inner corners and markers of "
         f"{layout.dictionary}"

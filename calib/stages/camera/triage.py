@@ -37,15 +37,8 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.words import several
 from calib.solve.chance import tail_of_f
 from calib.solve.information import scaled_inverse
+from calib.stages.camera import checks
 from calib.stages.camera.bundle import Calibration, joint_jacobian, minimise, poses_with_camera, refitted
-from calib.stages.camera.checks import (
-    Evidence,
-    apart_px,
-    evidence,
-    gain,
-    overdispersion,
-    points_C,
-)
 from calib.stages.camera.model import Block, LeftOut, Observations, project, scale_of
 from calib.stages.camera.verdict import Limits, far_points, quiet_rms
 
@@ -139,13 +132,13 @@ class _Disagreement:
         return np.where(self.freedom > 0, found, 1.0)
 
 
-def _scaled(found: Evidence, whole: FloatArray) -> tuple[Evidence, FloatArray]:
+def _scaled(found: checks.Evidence, whole: FloatArray) -> tuple[checks.Evidence, FloatArray]:
     """The evidence in units in which the diagonal of `whole` (G, G) is one, and these units (G,)."""
     unit = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
     return replace(found, S=found.S * unit[:, None] * unit, b=found.b * unit), unit
 
 
-def _disagreement(found: Evidence, core: BoolArray) -> _Disagreement:
+def _disagreement(found: checks.Evidence, core: BoolArray) -> _Disagreement:
     """T_i of every view against the core without it, from `_scaled` evidence."""
     S, b = found.S, found.b
     G = b.shape[1]
@@ -173,7 +166,7 @@ def _disagreement(found: Evidence, core: BoolArray) -> _Disagreement:
     return _Disagreement(S_core, d, score, freedom, T / np.maximum(freedom, 1), variance, typical, phi2)
 
 
-def _first_core(found: Evidence) -> BoolArray:
+def _first_core(found: checks.Evidence) -> BoolArray:
     """The six tenths of the views that fit one camera best, (N,).
 
     Concentration starts from all views and from those without one or two that would gain most by a camera of
@@ -210,7 +203,7 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
     ----------
     calibration : camera of the core, with the poses of all views; the target rigid, without robust loss.
     """
-    found = evidence(calibration)
+    found = checks.evidence(calibration)
     found, unit = _scaled(found, found.S.sum(axis=0))
     if core is None:
         core = _first_core(found)
@@ -239,7 +232,7 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
 
 def _moved_px(calibration: Calibration, shift: FloatArray) -> FloatArray:
     """Farthest that changes (N, G) of the intrinsics move one of the directions that were seen, (N,)."""
-    used = points_C(calibration)
+    used = checks.points_C(calibration)
     some = used[:: max(1, len(used) // 300)]
     J = joint_jacobian(calibration, some)[:, :, : shift.shape[1]]
     return np.asarray(np.linalg.norm(np.einsum("mcg,ng->nmc", J, shift), axis=2).max(axis=1))
@@ -287,7 +280,7 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
     if N < _LEAST_TURNED:
         return []
     try:
-        found = evidence(calibration)
+        found = checks.evidence(calibration)
     except ValueError:
         return []
     best: tuple[float, str, BoolArray, FloatArray] | None = None
@@ -302,8 +295,8 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
         there, read = (found.cost_at(d), other.cost_at(d)), _read(found, other, turned)
         sigma_px = np.sqrt(max(total, 0.0) / max(calibration.degrees_of_freedom, 1))
         at_d = replace(read, b=read.b + read.S @ d, sigma_px=float(sigma_px))
-        least = found.cost - gain(found.S, found.b)
-        least_gain = (_TURN_SIGMAS * overdispersion(at_d) * sigma_px) ** 2
+        least = found.cost - checks.gain(found.S, found.b)
+        least_gain = (_TURN_SIGMAS * checks.overdispersion(at_d) * sigma_px) ** 2
         # Where they explain it alike a picture was turned: that happens more often.
         if best is not None and total > best[0] - least_gain:
             continue
@@ -320,7 +313,7 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
     if best is None or not best[2].any():
         return []
     _, how, which, difference = best
-    moved_px = apart_px(calibration, difference)
+    moved_px = checks.apart_px(calibration, difference)
     if moved_px < _TURN_PX * scale_of(calibration.camera.image_size_px):
         return []
     why = (
@@ -330,14 +323,14 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
     return [LeftOut(calibration.observations.names[i], why, "view") for i in np.flatnonzero(which)]
 
 
-def _without_one(found: Evidence) -> float:
+def _without_one(found: checks.Evidence) -> float:
     """Least cost of a reading of all views but one, with the camera that suits these."""
     S, b = found.S.sum(axis=0) - found.S, found.b.sum(axis=0) - found.b
-    cost = found.cost.sum() - found.cost - gain(S, b)
+    cost = found.cost.sum() - found.cost - checks.gain(S, b)
     return float((cost / (found.measured.sum() - found.measured)).min())
 
 
-def _read(found: Evidence, other: Evidence, turned: BoolArray) -> Evidence:
+def _read(found: checks.Evidence, other: checks.Evidence, turned: BoolArray) -> checks.Evidence:
     """The views as they are, and those that are turned as they are then."""
     of = turned[:, None]
     return replace(
@@ -348,7 +341,9 @@ def _read(found: Evidence, other: Evidence, turned: BoolArray) -> Evidence:
     )
 
 
-def _agree_turned(found: Evidence, other: Evidence, turned: BoolArray) -> tuple[BoolArray, BoolArray]:
+def _agree_turned(
+    found: checks.Evidence, other: checks.Evidence, turned: BoolArray
+) -> tuple[BoolArray, BoolArray]:
     """Which views (N,) agree with those that agree best when these are turned, and which are odd as they are.
 
     Another view that is odd may make some look turned.
@@ -374,7 +369,7 @@ def _reflection(calibration: Calibration, names: tuple[str, ...]) -> tuple[Float
     return np.where(changes, -1.0, 1.0), np.where(changes, full - 2.0 * now, 0.0)
 
 
-def _parted(found: Evidence, other: Evidence) -> tuple[BoolArray, FloatArray, float]:
+def _parted(found: checks.Evidence, other: checks.Evidence) -> tuple[BoolArray, FloatArray, float]:
     """Which views (N,) are turned, the step d (G,) to the camera that all then share, and their cost.
 
     Parameters

@@ -25,36 +25,7 @@ from calib.core.arrays import BoolArray, FloatArray
 from calib.core.geometry import box_grid
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.core.words import several
-from calib.stages.camera.bundle import (
-    Calibration,
-    Covariance,
-    covariance,
-    projection_sigma_px,
-    refitted,
-)
-from calib.stages.camera.checks import (
-    CHI2_95,
-    FAULTS,
-    ONE_TO_ONE_REACH,
-    Split,
-    TargetShape,
-    alone_px,
-    best_next_view,
-    best_split,
-    conditioned,
-    evidence,
-    hull,
-    hull_area,
-    image_outline,
-    inside_hull,
-    lens_shape,
-    other_starts,
-    overdispersion,
-    straightened,
-    target_shape,
-    view_faults,
-    widened,
-)
+from calib.stages.camera import bundle, checks
 from calib.stages.camera.model import LeftOut, Observations, scale_of
 
 
@@ -166,7 +137,7 @@ _CLOSER = "Bring the board closer, so that it fills a third of the picture or mo
 # Is the camera determined by the views?
 
 
-def _of_solution(calibration: Calibration) -> Iterator[Finding]:
+def _of_solution(calibration: bundle.Calibration) -> Iterator[Finding]:
     """Enough views and points, and a solver that arrived."""
     views, points = calibration.observations.views, calibration.observations.points
     short = calibration.decrement
@@ -199,9 +170,9 @@ def _of_solution(calibration: Calibration) -> Iterator[Finding]:
         yield Finding("poor", text, _MORE_VIEWS)
 
 
-def _of_lens(calibration: Calibration) -> Iterator[Finding]:
+def _of_lens(calibration: bundle.Calibration) -> Iterator[Finding]:
     """The radial curve has to rise over the image, and the focal length has to be a lens's."""
-    camera, found = calibration.camera, lens_shape(calibration)
+    camera, found = calibration.camera, checks.lens_shape(calibration)
     width = max(camera.image_size_px)
     if found.folds_among_points:
         text = (
@@ -215,7 +186,7 @@ def _of_lens(calibration: Calibration) -> Iterator[Finding]:
     elif not found.one_to_one:
         text = (
             f"The lens model is one-to-one up to {100 * found.reach:.0f} % of the way to the picture's "
-            f"corners only ({100 * ONE_TO_ONE_REACH:.0f} is good; points were seen "
+            f"corners only ({100 * checks.ONE_TO_ONE_REACH:.0f} is good; points were seen "
             f"{100 * _radius_share(calibration):.0f} % of the way); "
             f"{100 * (1 - found.image_shown):.0f} % of the picture's border cannot be undistorted."
         )
@@ -261,7 +232,7 @@ def _of_denominator(sigma_share: float) -> Iterator[Finding]:
         yield Finding(kind, text, "Use a simpler lens model.")
 
 
-def _of_richer(fit: Calibration, wide: Calibration) -> Iterator[Finding]:
+def _of_richer(fit: bundle.Calibration, wide: bundle.Calibration) -> Iterator[Finding]:
     """Errors that the lens model leaves and five coefficients take away."""
     drop = 1.0 - wide.rms_px / max(fit.rms_px, 1e-300)
     if drop >= Limits.lens_remark:
@@ -273,11 +244,11 @@ def _of_richer(fit: Calibration, wide: Calibration) -> Iterator[Finding]:
         yield Finding("poor" if serious else "remark", text, "Use a richer lens model.")
 
 
-def _of_projection(fit: Calibration, known: Covariance, inflation: float) -> Iterator[Finding]:
+def _of_projection(fit: bundle.Calibration, known: bundle.Covariance, inflation: float) -> Iterator[Finding]:
     """Standard deviation of projection, inflated, where points were seen."""
-    outline = hull(fit.observations.pixels[fit.observations.present])
+    outline = checks.hull(fit.observations.pixels[fit.observations.present])
     grid = box_grid([*outline.min(axis=0), *outline.max(axis=0)], 14, 12).reshape(-1, 2)
-    spread = inflation * projection_sigma_px(fit, known, grid[inside_hull(grid, outline)])
+    spread = inflation * bundle.projection_sigma_px(fit, known, grid[checks.inside_hull(grid, outline)])
     bounded = spread[~np.isnan(spread)]
     sigma_px = float(np.median(bounded)) if len(bounded) else np.inf
     limit = Limits.projection_share * max(fit.camera.image_size_px)
@@ -292,15 +263,17 @@ def _of_projection(fit: Calibration, known: Covariance, inflation: float) -> Ite
         yield Finding("poor", text, "Take more pictures, with the board tilted and close.")
 
 
-def _of_border(fit: Calibration, sturdy: Calibration) -> Iterator[Finding]:
+def _of_border(fit: bundle.Calibration, sturdy: bundle.Calibration) -> Iterator[Finding]:
     """Standard deviation of projection, inflated, at the points of the border that the lens can show.
 
     The denominator of the rational model counts, unless nothing bounds it.
     """
-    known = covariance(fit)
+    known = bundle.covariance(fit)
     if not np.all(np.isfinite(known.joint)):
-        fit, known = sturdy, covariance(sturdy)
-    sigma_px = overdispersion(evidence(fit)) * projection_sigma_px(fit, known, image_outline(fit.camera))
+        fit, known = sturdy, bundle.covariance(sturdy)
+    sigma_px = checks.overdispersion(checks.evidence(fit)) * bundle.projection_sigma_px(
+        fit, known, checks.image_outline(fit.camera)
+    )
     sigma_px = sigma_px[~np.isnan(sigma_px)]
     limit = Limits.border_share * max(fit.camera.image_size_px)
     if len(sigma_px) and (most := float(sigma_px.max())) > limit:
@@ -315,16 +288,16 @@ def _of_border(fit: Calibration, sturdy: Calibration) -> Iterator[Finding]:
         yield Finding("poor" if median > limit else "remark", text, _IN_CORNERS)
 
 
-def _of_starts(calibration: Calibration, inflation: float) -> Iterator[Finding]:
+def _of_starts(calibration: bundle.Calibration, inflation: float) -> Iterator[Finding]:
     """All starts have to reach one minimum, or clearly worse ones.
 
     Worse by more than chance is not clear enough where the model itself is in error, so that a minimum
     far away with a cost a tenth higher counts as a rival, too.
     """
-    own, chance = calibration.squared_sum, CHI2_95 * (inflation * calibration.sigma_px) ** 2
+    own, chance = calibration.squared_sum, checks.CHI2_95 * (inflation * calibration.sigma_px) ** 2
     fx = calibration.camera.fx_px
-    near = max(0.02, 5 * inflation * covariance(calibration).sigma()["fx_px"] / fx)
-    for focal_px, end in sorted(other_starts(calibration), key=lambda one: one[1].cost):
+    near = max(0.02, 5 * inflation * bundle.covariance(calibration).sigma()["fx_px"] / fx)
+    for focal_px, end in sorted(checks.other_starts(calibration), key=lambda one: one[1].cost):
         other = float(end.block.intrinsics[0])
         rms = float(np.sqrt(end.cost / calibration.observations.points))
         apart = abs(other / fx - 1.0)
@@ -354,8 +327,8 @@ def _of_starts(calibration: Calibration, inflation: float) -> Iterator[Finding]:
 
 def of_faults(observations: Observations) -> Iterator[Finding]:
     """Views that cannot be views of the board at all."""
-    faults = view_faults(observations)
-    for what in FAULTS:
+    faults = checks.view_faults(observations)
+    for what in checks.FAULTS:
         some = [name for name, fault in zip(observations.names, faults, strict=True) if fault == what]
         if len(some) == len(faults):
             yield Finding("unidentifiable", f"All views show {what}.")
@@ -417,7 +390,7 @@ def of_copies(copies: Sequence[LeftOut]) -> Iterator[Finding]:
 _MOST_NORMALS = 2000
 
 
-def _of_coverage(calibration: Calibration) -> Iterator[Finding]:
+def _of_coverage(calibration: bundle.Calibration) -> Iterator[Finding]:
     """Tilts, size in the picture, and the part of the picture that was covered."""
     observations = calibration.observations
     width, height = calibration.camera.image_size_px
@@ -434,7 +407,7 @@ def _of_coverage(calibration: Calibration) -> Iterator[Finding]:
             "length shows only in boards that are tilted differently."
         )
         yield Finding("unidentifiable" if spread_deg < Limits.spread_free_deg else "poor", text, _MORE_TILT)
-    area_share = hull_area(observations.pixels[observations.present]) / (width * height)
+    area_share = checks.hull_area(observations.pixels[observations.present]) / (width * height)
     if area_share < Limits.area_poor:
         text = (
             f"All points together span {100 * area_share:.0f} % of the picture "
@@ -447,7 +420,7 @@ def _of_coverage(calibration: Calibration) -> Iterator[Finding]:
             "beyond, the distortion is extrapolated."
         )
         yield Finding("remark", text, _CORNERS)
-    areas = [hull_area(p[on]) for p, on in zip(observations.pixels, observations.present, strict=True)]
+    areas = [checks.hull_area(p[on]) for p, on in zip(observations.pixels, observations.present, strict=True)]
     view_share = float(np.median(areas)) / (width * height)
     if view_share < Limits.view_poor:
         text = (
@@ -457,14 +430,14 @@ def _of_coverage(calibration: Calibration) -> Iterator[Finding]:
         yield Finding("poor", text, _CLOSER)
 
 
-def _radius_share(calibration: Calibration) -> float:
+def _radius_share(calibration: bundle.Calibration) -> float:
     """Largest distance of a point from the principal point over that of the image's farthest corner."""
     camera, observations = calibration.camera, calibration.observations
     seen = observations.pixels[observations.present]
     return float(np.linalg.norm(seen - camera.centre_px, axis=1).max() / camera.farthest_px)
 
 
-def _of_frame(calibration: Calibration) -> Iterator[Finding]:
+def _of_frame(calibration: bundle.Calibration) -> Iterator[Finding]:
     """Points listed mirrored, and the principal point in the picture."""
     camera = calibration.camera
     mirrored = calibration.block.R_CT[:, 2, 2] < 0.0
@@ -488,7 +461,7 @@ def _of_frame(calibration: Calibration) -> Iterator[Finding]:
         yield Finding("poor" if off > Limits.centre_poor or swapped else "remark", text)
 
 
-def _of_misfit(calibration: Calibration) -> Iterator[Finding]:
+def _of_misfit(calibration: bundle.Calibration) -> Iterator[Finding]:
     """Residuals too large, bad views, bad points, and residuals that are not independent normal noise."""
     names, present = calibration.observations.names, calibration.observations.present
     squared = np.where(present, (calibration.residuals_px**2).sum(axis=2), 0.0)
@@ -577,7 +550,7 @@ def _of_points(distance: FloatArray, fine: BoolArray, names: tuple[str, ...]) ->
         yield Finding("poor" if many else "remark", text, advice)
 
 
-def _repeated(calibration: Calibration) -> float:
+def _repeated(calibration: bundle.Calibration) -> float:
     """RMS over the target's points of the mean residual over views, in the target's axes.
 
     Over what it would be if the views' errors were independent.
@@ -594,9 +567,9 @@ def _repeated(calibration: Calibration) -> float:
     return float(np.sqrt((mean**2 * count[:, None]).mean() / spread)) if spread > 0.0 else 1.0
 
 
-def _of_change(fit: Calibration) -> Iterator[Finding]:
+def _of_change(fit: bundle.Calibration) -> Iterator[Finding]:
     """One camera and one board in all views, not another in each."""
-    alone = float(np.sqrt(2)) * alone_px(fit)
+    alone = float(np.sqrt(2)) * checks.alone_px(fit)
     change = float(np.sqrt(max(2 * fit.sigma_px**2 - alone**2, 0.0)))
     scale = scale_of(fit.camera.image_size_px)
     together = float(np.hypot(alone, change))
@@ -619,7 +592,7 @@ def _of_change(fit: Calibration) -> Iterator[Finding]:
 _SEPARATELY = "Calibrate the two groups separately, with focus and zoom locked."
 
 
-def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding]:
+def _of_split(found: checks.Split | None, calibration: bundle.Calibration) -> Iterator[Finding]:
     """One camera, or two."""
     if found is None or found.ratio < (Limits.change_ratio if found.in_order else Limits.split_ratio):
         return
@@ -674,7 +647,7 @@ def _of_split(found: Split | None, calibration: Calibration) -> Iterator[Finding
     yield Finding("inconsistent", text, _SEPARATELY)
 
 
-def _of_target(found: TargetShape | None, calibration: Calibration) -> Iterator[Finding]:
+def _of_target(found: checks.TargetShape | None, calibration: bundle.Calibration) -> Iterator[Finding]:
     """Squares that are square, on a board that is flat."""
     if found is None:
         return
@@ -729,7 +702,7 @@ _LEFT_OUT_WEIGHT = 0.5
 """Points that a robust loss weighs less are left out of the checks."""
 
 
-def judge(calibration: Calibration, findings: Sequence[Finding] = ()) -> Verdict:
+def judge(calibration: bundle.Calibration, findings: Sequence[Finding] = ()) -> Verdict:
     """Judge a calibration by its views alone.
 
     Parameters
@@ -754,7 +727,7 @@ def judge(calibration: Calibration, findings: Sequence[Finding] = ()) -> Verdict
     return Verdict.of([*every, *_next_picture(sturdy, verdict)])
 
 
-def _by_the_rules(calibration: Calibration) -> tuple[list[Finding], Calibration | None]:
+def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundle.Calibration | None]:
     """What the rules find, and the `conditioned` fit where there is one that more views can improve."""
     findings = list(_of_solution(calibration))
     if not np.all(np.isfinite(calibration.block.intrinsics)) or not np.all(np.isfinite(calibration.normal)):
@@ -766,26 +739,26 @@ def _by_the_rules(calibration: Calibration) -> tuple[list[Finding], Calibration 
     if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
         return findings, None
     findings += _of_misfit(fit)
-    sturdy = conditioned(fit)
+    sturdy = checks.conditioned(fit)
     if sturdy is not fit:
-        findings += _of_denominator(_focal_share(fit, covariance(fit)))
-    known, inflation = covariance(sturdy), overdispersion(evidence(sturdy))
+        findings += _of_denominator(_focal_share(fit, bundle.covariance(fit)))
+    known, inflation = bundle.covariance(sturdy), checks.overdispersion(checks.evidence(sturdy))
     share = _focal_share(sturdy, known)
     if calibration.basis is not None:
         # A target that was deformed to fit costs certainty, which the rigid target in its shape hides.
-        share = max(share, _focal_share(calibration, covariance(calibration)))
+        share = max(share, _focal_share(calibration, bundle.covariance(calibration)))
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
     findings += _of_projection(sturdy, known, inflation)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
-    wide = widened(some)
-    shape = target_shape(wide)
+    wide = checks.widened(some)
+    shape = checks.target_shape(wide)
     findings += [*_of_richer(some, wide), *_of_target(shape, wide)]
     if shape is not None:
-        wide = straightened(wide, shape.displacement_m)
+        wide = checks.straightened(wide, shape.displacement_m)
     findings += [
-        *_of_split(best_split(wide), wide),
+        *_of_split(checks.best_split(wide), wide),
         *_of_change(wide),
         *_of_border(fit, sturdy),
         *_of_lens(fit),
@@ -793,13 +766,13 @@ def _by_the_rules(calibration: Calibration) -> tuple[list[Finding], Calibration 
     return findings, sturdy
 
 
-def two_cameras(calibration: Calibration) -> list[Finding]:
+def two_cameras(calibration: bundle.Calibration) -> list[Finding]:
     """Whether views come from two cameras, or from one that was refocused on the way."""
-    wide = widened(_sampled(conditioned(calibration)))
-    return list(_of_split(best_split(wide), wide))
+    wide = checks.widened(_sampled(checks.conditioned(calibration)))
+    return list(_of_split(checks.best_split(wide), wide))
 
 
-def _plain(calibration: Calibration) -> Calibration:
+def _plain(calibration: bundle.Calibration) -> bundle.Calibration:
     """The same fit by least squares: a robust loss turned into points left out, the target rigid."""
     observations = calibration.observations
     if calibration.basis is None and calibration.loss == "none":
@@ -811,27 +784,27 @@ def _plain(calibration: Calibration) -> Calibration:
         observations = observations.select(kept)
     start = replace(calibration.block.part(kept), deformation=np.zeros(0))
     shaped = calibration.shaped(observations)
-    return refitted(calibration, observations=shaped, start=start, basis=None, loss="none")
+    return bundle.refitted(calibration, observations=shaped, start=start, basis=None, loss="none")
 
 
-def _focal_share(fit: Calibration, known: Covariance) -> float:
+def _focal_share(fit: bundle.Calibration, known: bundle.Covariance) -> float:
     """Larger relative standard deviation of the focal lengths."""
     sigma = known.sigma()
     return max(sigma["fx_px"] / fit.camera.fx_px, sigma["fy_px"] / fit.camera.fy_px)
 
 
-def _sampled(fit: Calibration) -> Calibration:
+def _sampled(fit: bundle.Calibration) -> bundle.Calibration:
     views = fit.observations.views
     if views <= _SAMPLE:
         return fit
-    return refitted(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
+    return bundle.refitted(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
 
 
-def _next_picture(fit: Calibration, verdict: Verdict) -> Iterator[Finding]:
+def _next_picture(fit: bundle.Calibration, verdict: Verdict) -> Iterator[Finding]:
     width = max(fit.camera.image_size_px)
     if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
         return
-    plan = best_next_view(fit, evidence(fit).S.sum(axis=0))
+    plan = checks.best_next_view(fit, checks.evidence(fit).S.sum(axis=0))
     if plan is None:
         return
     best = plan.best

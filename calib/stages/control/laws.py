@@ -11,20 +11,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.stages.actuator.dynamics import (
-    coefficients,
-    coriolis_matrix,
-    linearised,
-    mass_matrix,
-    resisting_forces,
-)
-from calib.stages.actuator.kinematics import (
-    MARKER_OFFSET_M,
-    angle,
-    forward,
-    forward_jacobian,
-    marker_from_head,
-)
+from calib.stages.actuator import dynamics, kinematics
 from calib.stages.actuator.parameters import TICK_S, Plant
 from calib.stages.actuator.pump import (
     PWM_MAX,
@@ -221,7 +208,7 @@ def pwm_of_force(model: Model, force_N: FloatArray) -> FloatArray:
 def holding_force(plant: Plant, q_m: FloatArray) -> FloatArray:
     """Forces (..., 2) [N] that hold the bellows at the lengths (..., 2) [m] after all creep."""
     q = np.asarray(q_m, dtype=np.float64)
-    return resisting_forces(plant, q, np.zeros_like(q))
+    return dynamics.resisting_forces(plant, q, np.zeros_like(q))
 
 
 def moving_force(
@@ -229,10 +216,10 @@ def moving_force(
 ) -> FloatArray:
     """Forces (..., 2) [N] that move the bellows so, with creep forces z (..., 2) [N]; all (..., 2)."""
     q, dq = np.asarray(q_m, dtype=np.float64), np.asarray(dq_mps, dtype=np.float64)
-    inertia = np.einsum("...rc,...c->...r", mass_matrix(plant, q), np.asarray(ddq_mps2))
-    swept = np.einsum("...rc,...c->...r", coriolis_matrix(plant, q, dq), dq)
+    inertia = np.einsum("...rc,...c->...r", dynamics.mass_matrix(plant, q), np.asarray(ddq_mps2))
+    swept = np.einsum("...rc,...c->...r", dynamics.coriolis_matrix(plant, q, dq), dq)
     crept = plant.creep_rates[2] * np.asarray(z_N)
-    return np.asarray(inertia + swept + resisting_forces(plant, q, dq) - crept)
+    return np.asarray(inertia + swept + dynamics.resisting_forces(plant, q, dq) - crept)
 
 
 def creep_along(plant: Plant, tick_s: float, dq_mps: FloatArray) -> FloatArray:
@@ -282,8 +269,8 @@ def bent_rest(model: Model, phi_rad: float) -> FloatArray:
 
 def static_stiffness(plant: Plant, q_m: FloatArray) -> FloatArray:
     """dF/dq (2, 2) [N/m] of `holding_force` at the lengths (2,)."""
-    A = linearised(plant, q_m)
-    return np.asarray(-mass_matrix(plant, q_m) @ A[2:4, :2])
+    A = dynamics.linearised(plant, q_m)
+    return np.asarray(-dynamics.mass_matrix(plant, q_m) @ A[2:4, :2])
 
 
 def feed_forward_pwm(model: Model, q_ref_m: FloatArray) -> FloatArray:
@@ -566,7 +553,7 @@ class Observer:
 
     def _advanced(self, y: FloatArray, before: PumpEstimate, after: PumpEstimate) -> FloatArray:
         """Plant (6,) after a tick in which the pumps' forces go in a straight line."""
-        c, tick_s = coefficients(self.model.plant), self.model.tick_s
+        c, tick_s = dynamics.coefficients(self.model.plant), self.model.tick_s
         steps = max(4, math.ceil(1.5 * tick_s / largest_step_s(self.model.plant)))
         h, d = tick_s / steps, self.d_N
         start, end = np.array(before.force_N) + d, np.array(after.force_N) + d
@@ -627,18 +614,21 @@ class Observer:
 
 def marker_of(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
     """The marker (2,) [m] of the lengths (2,) [m] (3.6), (A.1)."""
-    head = forward(q_m, bellows_radius_m)
-    return marker_from_head(head[:2], head[2], offset_m)
+    head = kinematics.forward(q_m, bellows_radius_m)
+    return kinematics.marker_from_head(head[:2], head[2], offset_m)
 
 
 def marker_jacobian(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
     """d(x, y) / d(q1, q2), shape (2, 2), of `marker_of`."""
-    phi, J = float(angle(q_m, bellows_radius_m)), forward_jacobian(q_m, bellows_radius_m)
+    phi, J = (
+        float(kinematics.angle(q_m, bellows_radius_m)),
+        kinematics.forward_jacobian(q_m, bellows_radius_m),
+    )
     return np.asarray(J[:2] + offset_m * np.outer([math.cos(phi), -math.sin(phi)], J[2]))
 
 
 def design_observer(
-    model: Model, latency_s: float = 0.025, marker_offset_m: float = MARKER_OFFSET_M
+    model: Model, latency_s: float = 0.025, marker_offset_m: float = kinematics.MARKER_OFFSET_M
 ) -> Observer:
     """The observer whose gain is the stationary Kalman filter's in the middle of the workspace.
 
@@ -649,8 +639,8 @@ def design_observer(
     plant, h = model.plant, model.tick_s
     q = np.full(2, plant.rest_length_m + _AT_M)
     A = np.zeros((STATES, STATES))
-    A[:6, :6] = linearised(plant, q)
-    inverse = np.linalg.inv(mass_matrix(plant, q))
+    A[:6, :6] = dynamics.linearised(plant, q)
+    inverse = np.linalg.inv(dynamics.mass_matrix(plant, q))
     A[2:4, 6:8] = inverse
     pushed = np.zeros(STATES)
     pushed[2:4] = _ACCEL_MPS2_PER_SQRT_HZ**2
@@ -760,7 +750,7 @@ def computed_torque_step(
     if control.Kp_per_s2 or control.Kd_per_s:
         v = control.Kp_per_s2 * (wanted.q_m[arrives] - y[:2])
         v = v + control.Kd_per_s * (wanted.dq_mps[arrives] - y[2:4])
-        force = force + mass_matrix(model.plant, y[:2]) @ v
+        force = force + dynamics.mass_matrix(model.plant, y[:2]) @ v
     pwm = pwm_for_force(model, pumps, force, control.horizon_ticks)
     F = np.array(pumps.force_N)
     lowest = np.maximum(F - T * falling_rate(model, F), 0.0)

@@ -15,16 +15,8 @@ from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.logs import columns_of
 from calib.io.tables import read_cells
 from calib.stages.actuator.kinematics import inverse
+from calib.stages.control import references
 from calib.stages.control.laws import Model
-from calib.stages.control.references import (
-    BUILT_IN,
-    LONGEST_S,
-    Reference,
-    built_in,
-    from_angles,
-    from_lengths,
-    resampled,
-)
 
 # ----------------------------------------------------------------------
 # References from files: a table of lengths, angles or head positions, or a recorded log.
@@ -73,7 +65,7 @@ def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     return names, t[newest], table[newest, 1:]
 
 
-def read_reference(path: Path, model: Model) -> Reference:
+def read_reference(path: Path, model: Model) -> references.Reference:
     """The reference in a file, at the model's ticks.
 
     Raises `BadInputError` with file and line for what is none, values that are not finite and times that
@@ -88,27 +80,27 @@ def read_reference(path: Path, model: Model) -> Reference:
             f"{source}: has {len(t)} rows over {span:.3g} s, expected at least {_FEWEST} rows and "
             f"{_FEWEST * h:.3g} s"
         )
-    if span > LONGEST_S:
-        raise BadInputError(f"{source}: lasts {span:g} s, expected at most {LONGEST_S:g} s")
-    ticks = resampled(t, values, h)
+    if span > references.LONGEST_S:
+        raise BadInputError(f"{source}: lasts {span:g} s, expected at most {references.LONGEST_S:g} s")
+    ticks = references.resampled(t, values, h)
     if names == ("phi_rad",):
         try:
-            return from_angles(model, source, ticks[:, 0])
+            return references.from_angles(model, source, ticks[:, 0])
         except BadInputError as error:
             raise BadInputError(f"{source}: {error}") from error
     if names == ("x_m", "y_m"):
         turned = 2.0 * np.arctan2(ticks[:, 0], ticks[:, 1])
-        return from_lengths(
+        return references.from_lengths(
             model, source, inverse(np.column_stack([ticks, turned]), model.plant.bellows_radius_m)
         )
-    return from_lengths(model, source, ticks)
+    return references.from_lengths(model, source, ticks)
 
 
 _HEAD = ("t_s", "q1_m", "q2_m", "phi_rad")
 REFERENCE = Kind("a reference", (".csv",), lambda path: column_names(path) == _HEAD)
 
 
-def write_reference(path: Path, reference: Reference) -> None:
+def write_reference(path: Path, reference: references.Reference) -> None:
     """Write time, lengths and angle. Raises `BadInputError` where the place cannot be written."""
     rows = [",".join(_HEAD)]
     for t, q1, q2, phi in np.column_stack([reference.t_s, reference.q_m, reference.phi_rad]).tolist():
@@ -129,7 +121,7 @@ def is_recorded(path: Path) -> bool:
     return {"u_px", "v_px"} <= set(columns_of(path) or ()) and not set(column_names(path)) & set(_OWN)
 
 
-def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Reference:
+def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> references.Reference:
     """The lengths that a log of camera and IMU shows, at the model's ticks.
 
     Raises `BadInputError` as `calib.stages.estimator.replay.opened`, and where the estimator knows too
@@ -142,26 +134,28 @@ def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> Re
     rows = rows[np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])] if len(rows) else rows
     if len(rows) < _FEWEST:
         raise BadInputError(f"{shown(path)}: shows no lengths to follow, expected camera and IMU in motion")
-    return from_lengths(model, shown(path), resampled(rows[:, 0], rows[:, 1:3], model.tick_s))
+    return references.from_lengths(
+        model, shown(path), references.resampled(rows[:, 0], rows[:, 1:3], model.tick_s)
+    )
 
 
 def wanted_reference(
     text: str, model: Model, duration_s: float | None, rig: Rig, rig_path: Path
-) -> Reference:
+) -> references.Reference:
     """A reference by name, from a table, or from a recorded log.
 
     Raises `BadInputError`, also where a file is given a duration.
     """
-    if text in BUILT_IN:
-        return built_in(model, text, duration_s)
+    if text in references.BUILT_IN:
+        return references.built_in(model, text, duration_s)
     path = Path(text)
     if not path.exists():
         raise BadInputError(
-            f"{shown(text)}: is no such file and none of the references {', '.join(BUILT_IN)}"
+            f"{shown(text)}: is no such file and none of the references {', '.join(references.BUILT_IN)}"
         )
     if duration_s is not None:
         raise BadInputError(
-            f"{shown(text)}: a file has its own duration, --duration is for {', '.join(BUILT_IN)}"
+            f"{shown(text)}: a file has its own duration, --duration is for {', '.join(references.BUILT_IN)}"
         )
     if path.is_file() and is_recorded(path):
         return recorded_reference(path, rig, rig_path, model)

@@ -12,18 +12,7 @@ from calib.core.arrays import BoolArray, ComplexArray, FloatArray, rms
 from calib.core.errors import BadInputError
 from calib.stages.actuator.dynamics import linearised, mass_matrix
 from calib.stages.actuator.kinematics import angle, forward
-from calib.stages.control.laws import (
-    Model,
-    Pid,
-    bent_rest,
-    falling_rate,
-    force_of_pwm,
-    holding_force,
-    largest_force_N,
-    pwm_of_force,
-    static_stiffness,
-    wanted_motion,
-)
+from calib.stages.control import laws
 from calib.stages.control.references import Reference
 from calib.stages.control.section import ControllerCriterion
 
@@ -113,7 +102,7 @@ def spectral_radius(system: System) -> float:
     return float(np.abs(np.linalg.eigvals(system.A)).max()) if len(system.A) else 0.0
 
 
-def pid_system(pid: Pid) -> System:
+def pid_system(pid: laws.Pid) -> System:
     """(D.6) as a system: the sum of the past errors times h, and the last error, each where it is used."""
     h, I, D = pid.tick_s, pid.Ki != 0.0, pid.Kd != 0.0  # noqa: E741  the field's letters
     used = [i for i, wanted in enumerate((I, D)) if wanted]
@@ -123,18 +112,18 @@ def pid_system(pid: Pid) -> System:
     return System(A[np.ix_(used, used)], B[used], C[:, used], whole, h)
 
 
-def pump_slope(model: Model, q_m: FloatArray) -> FloatArray:
+def pump_slope(model: laws.Model, q_m: FloatArray) -> FloatArray:
     """dg/du (2,) [N/PWM] of the static maps where they hold the lengths (2,); 0 outside their limits."""
-    force = holding_force(model.plant, q_m)
-    pwm = pwm_of_force(model, force)
+    force = laws.holding_force(model.plant, q_m)
+    pwm = laws.pwm_of_force(model, force)
     step = 1.0
     low, high = np.maximum(pwm - step, model.low_pwm), np.minimum(pwm + step, model.high_pwm)
-    slope = (force_of_pwm(model, high) - force_of_pwm(model, low)) / (high - low)
-    held = (force > 1e-9) & (force <= force_of_pwm(model, np.full(2, model.high_pwm)))
+    slope = (laws.force_of_pwm(model, high) - laws.force_of_pwm(model, low)) / (high - low)
+    held = (force > 1e-9) & (force <= laws.force_of_pwm(model, np.full(2, model.high_pwm)))
     return np.asarray(np.where(held, slope, 0.0))
 
 
-def rig_system(model: Model, q_m: FloatArray) -> System:
+def rig_system(model: laws.Model, q_m: FloatArray) -> System:
     """From PWM (2,) to lengths (2,) [m] about the rest at the lengths (2,) [m]."""
     from scipy.linalg import expm
 
@@ -158,7 +147,7 @@ _HAIR = 0.01
 """Of a tick, by which pictures may be later than whole ticks: the time offset is hardly known better."""
 
 
-def firmware_sensing(model: Model) -> System:
+def firmware_sensing(model: laws.Model) -> System:
     """Lengths (2,) as the firmware sees them: their mean late and low-passed, their difference at once."""
     from scipy.signal import butter
 
@@ -306,35 +295,35 @@ _NEWTON = 6
 _LONGEST_TICKS = 432_000
 
 
-def reachable(model: Model, q_m: FloatArray) -> BoolArray:
+def reachable(model: laws.Model, q_m: FloatArray) -> BoolArray:
     """Whether the pumps can hold the lengths (..., 2) [m], shape (...)."""
-    F, q = holding_force(model.plant, q_m), np.asarray(q_m)
+    F, q = laws.holding_force(model.plant, q_m), np.asarray(q_m)
     slack = 1e-9
-    held = (-slack <= F) & (largest_force_N(model) + slack >= F) & (q > 0.0)
+    held = (-slack <= F) & (laws.largest_force_N(model) + slack >= F) & (q > 0.0)
     return np.asarray(held.all(axis=-1))
 
 
-def longest_m(model: Model) -> float:
+def longest_m(model: laws.Model) -> float:
     """Greatest length [m] at which both bellows can be held alike."""
     from scipy.optimize import brentq
 
-    plant, most = model.plant, float(largest_force_N(model).min())
+    plant, most = model.plant, float(laws.largest_force_N(model).min())
     low, high = plant.rest_length_m, 4.0 * plant.rest_length_m
 
     def over(q: float) -> float:
-        return float(holding_force(plant, np.array([q, q]))[0]) - most
+        return float(laws.holding_force(plant, np.array([q, q]))[0]) - most
 
     return float(brentq(over, low, high)) if over(high) > 0.0 else high
 
 
-def largest_angle(model: Model, pump: int = 0) -> float:
+def largest_angle(model: laws.Model, pump: int = 0) -> float:
     """Greatest angle [rad] that one pump alone can hold, to its side: below zero for the second."""
-    low, high, most = 0.0, 1.5 * math.pi, float(largest_force_N(model)[pump])
+    low, high, most = 0.0, 1.5 * math.pi, float(laws.largest_force_N(model)[pump])
     side = 1.0 if pump == 0 else -1.0
     for _ in range(40):
         middle = 0.5 * (low + high)
         try:
-            held = float(holding_force(model.plant, bent_rest(model, side * middle))[pump]) <= most
+            held = float(laws.holding_force(model.plant, laws.bent_rest(model, side * middle))[pump]) <= most
         except BadInputError:
             held = False
         low, high = (middle, high) if held else (low, middle)
@@ -345,15 +334,15 @@ _ALIKE = 0.01
 """Between the pumps' strengths: less moves a margin by less than rounding the gains does (`_slack`)."""
 
 
-def unlike(model: Model) -> bool:
+def unlike(model: laws.Model) -> bool:
     """Whether the pumps differ so much that each side counts by itself."""
     return abs(math.log(model.strength[1] / model.strength[0])) > _ALIKE
 
 
-def approach_s(model: Model, q_m: FloatArray) -> float:
+def approach_s(model: laws.Model, q_m: FloatArray) -> float:
     """Time [s] with the pumps at their limit until the forces that hold the lengths (2,) are there."""
-    F = np.maximum(holding_force(model.plant, q_m), 0.0)
-    share = F / largest_force_N(model)
+    F = np.maximum(laws.holding_force(model.plant, q_m), 0.0)
+    share = F / laws.largest_force_N(model)
     if np.any(share >= 1.0):
         return math.inf
     return float(np.max(-model.pump.lag_s * np.log1p(-share))) + model.pump.delay_ticks * model.tick_s
@@ -390,25 +379,25 @@ class Following:
         return 1e3 * float(np.abs(self.missing_m).max())
 
 
-def _nearest(model: Model, wanted: FloatArray) -> FloatArray:
-    h, most = model.tick_s, largest_force_N(model)
+def _nearest(model: laws.Model, wanted: FloatArray) -> FloatArray:
+    h, most = model.tick_s, laws.largest_force_N(model)
     a = math.exp(-h / model.pump.lag_s)
     given = np.empty_like(wanted)
     given[0] = np.clip(wanted[0], 0.0, most)
     for k in range(1, len(wanted)):
         F = given[k - 1]
-        fall = np.maximum(F * a, F - h * falling_rate(model, F))
+        fall = np.maximum(F * a, F - h * laws.falling_rate(model, F))
         given[k] = np.clip(wanted[k], np.minimum(fall, most), most + (F - most) * a)
     return given
 
 
-def _reason(model: Model, q: FloatArray, wanted: FloatArray, k: int, missing: FloatArray) -> str:
+def _reason(model: laws.Model, q: FloatArray, wanted: FloatArray, k: int, missing: FloatArray) -> str:
     i = int(np.argmax(np.abs(missing[k])))
     jumps = np.abs(np.diff(q[max(k - 1, 0) : k + 3], axis=0))
     if float(jumps.max()) > _JUMP_M:
         j = int(np.argmax(jumps.max(axis=0)))
         return f"the reference of bellows {j + 1} jumps by {1e3 * jumps[:, j].max():.3g} mm within a tick"
-    F, most = float(wanted[k, i]), float(largest_force_N(model)[i])
+    F, most = float(wanted[k, i]), float(laws.largest_force_N(model)[i])
     name = f"bellows {i + 1}"
     if most < F:
         return f"{name} needs {F:.3g} N to be that long, its pump gives at most {most:.3g} N"
@@ -418,18 +407,18 @@ def _reason(model: Model, q: FloatArray, wanted: FloatArray, k: int, missing: Fl
     rate = float(wanted[k, i] - wanted[early, i]) / ((k - early) * model.tick_s) if k else 0.0
     if missing[k, i] > 0.0:
         return f"{name} would have to inflate at {rate:.3g} N/s, which its pump's lag does not allow"
-    least = float(falling_rate(model, np.array(F)))
+    least = float(laws.falling_rate(model, np.array(F)))
     return f"{name} would have to deflate at {-rate:.3g} N/s, its air leaves at {least:.3g} N/s"
 
 
-def follow(model: Model, q_m: FloatArray) -> Following:
+def follow(model: laws.Model, q_m: FloatArray) -> Following:
     """How far the pumps can follow lengths (n, 2) [m] at the ticks, three at least."""
-    wanted = wanted_motion(model, q_m).force_N
+    wanted = laws.wanted_motion(model, q_m).force_N
     given, h = _nearest(model, wanted), model.tick_s
     short = wanted - given
     missing = np.zeros_like(short)
     for k in np.flatnonzero(np.any(short != 0.0, axis=1)):
-        missing[k] = np.linalg.solve(static_stiffness(model.plant, q_m[k]), short[k])
+        missing[k] = np.linalg.solve(laws.static_stiffness(model.plant, q_m[k]), short[k])
     bad = np.flatnonzero(np.max(np.abs(missing), axis=1) > TOLERANCE_M)
     rates = np.diff(wanted, axis=0) / h
     at = int(bad[0]) if len(bad) else None
@@ -446,7 +435,7 @@ def follow(model: Model, q_m: FloatArray) -> Following:
     )
 
 
-def brought_in(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+def brought_in(model: laws.Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     """Lengths (n, 2) [m] with those just outside of the reachable set on its edge, and the longest way there.
 
     The edge is found by Newton's method on the forces that hold them, cut to what the pumps can give. Lengths
@@ -455,11 +444,11 @@ def brought_in(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     q = np.array(q_m, dtype=np.float64)
     moved = 0.0
     for k in np.flatnonzero(~reachable(model, q)):
-        wanted = np.clip(holding_force(model.plant, q[k]), 0.0, largest_force_N(model))
+        wanted = np.clip(laws.holding_force(model.plant, q[k]), 0.0, laws.largest_force_N(model))
         at = q[k].copy()
         for _ in range(_NEWTON):
-            short = wanted - holding_force(model.plant, at)
-            at = at + np.linalg.solve(static_stiffness(model.plant, at), short)
+            short = wanted - laws.holding_force(model.plant, at)
+            at = at + np.linalg.solve(laws.static_stiffness(model.plant, at), short)
             if np.abs(at - q[k]).max() > 2.0 * CLOSE_M:
                 break
         way = float(np.abs(at - q[k]).max())
@@ -479,17 +468,17 @@ def _path(q: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(points), np.concatenate(times)
 
 
-def _least_times(model: Model, points: FloatArray) -> FloatArray:
+def _least_times(model: laws.Model, points: FloatArray) -> FloatArray:
     """Least time (m - 1,) [s] of each piece between the points (m, 2) for forces at rest."""
-    F = np.maximum(holding_force(model.plant, points), 0.0)
-    most = largest_force_N(model)
+    F = np.maximum(laws.holding_force(model.plant, points), 0.0)
+    most = laws.largest_force_N(model)
     dF, middle = np.diff(F, axis=0), 0.5 * (F[1:] + F[:-1])
     up = model.pump.lag_s * dF / np.maximum(most - middle, 1e-3 * most)
-    down = -dF / np.maximum(falling_rate(model, middle), 1e-9)
+    down = -dF / np.maximum(laws.falling_rate(model, middle), 1e-9)
     return np.asarray(np.max(np.maximum(up, down), axis=1))
 
 
-def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+def slowed(model: laws.Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and how far it moved.
 
     Jumps become the fastest way along the straight line between their ends. Lengths that lie outside of the
@@ -674,21 +663,21 @@ class Point:
 class Tuned:
     """Gains and their margins at every operating point."""
 
-    pid: Pid
+    pid: laws.Pid
     points: tuple[Point, ...]
 
 
-def operating_angles(model: Model) -> tuple[tuple[float, float], ...]:
+def operating_angles(model: laws.Model) -> tuple[tuple[float, float], ...]:
     """Rests (q1, q2) [m] at 15, 40, 65 and 90 % of the greatest angle, one pump alone.
 
     To both sides where the pumps are unlike.
     """
     most = [largest_angle(model, pump) for pump in range(1 + unlike(model))]
-    rests = (bent_rest(model, share * one) for one in most for share in (0.15, 0.4, 0.65, 0.9))
+    rests = (laws.bent_rest(model, share * one) for one in most for share in (0.15, 0.4, 0.65, 0.9))
     return tuple((float(q[0]), float(q[1])) for q in rests)
 
 
-def operating_lengths(model: Model) -> tuple[tuple[float, float], ...]:
+def operating_lengths(model: laws.Model) -> tuple[tuple[float, float], ...]:
     """Rests (q1, q2) [m] at 10 to 95 % of the greatest elongation, and two that are bent.
 
     These to both sides where the pumps are unlike.
@@ -701,28 +690,28 @@ def operating_lengths(model: Model) -> tuple[tuple[float, float], ...]:
     return tuple(q for q in found if bool(reachable(model, np.array(q))))
 
 
-def orientation_loop(model: Model, pid: Pid, q_m: tuple[float, float]) -> System:
+def orientation_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> System:
     """Loop of (4.1) about a rest: error of the angle, both controllers, rig, angle."""
     return series(pid_system(pid), _angle_rig(model, q_m))
 
 
-def _angle_rig(model: Model, q_m: tuple[float, float]) -> System:
+def _angle_rig(model: laws.Model, q_m: tuple[float, float]) -> System:
     half, h = 0.5 / model.plant.bellows_radius_m, model.tick_s
     rig = rig_system(model, np.array(q_m))
     return series(gain(np.array([[1.0], [-1.0]]), h), series(rig, gain(np.array([[half, -half]]), h)))
 
 
-def position_loop(model: Model, pid: Pid, q_m: tuple[float, float]) -> System:
+def position_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> System:
     """Loop of (4.5) about a rest: errors of the lengths, both controllers, rig, lengths as seen."""
     return series(both_channels(pid), _position_rig(model, q_m))
 
 
-def both_channels(pid: Pid) -> System:
+def both_channels(pid: laws.Pid) -> System:
     """A controller for each bellows."""
     return side_by_side(pid_system(pid), pid_system(pid))
 
 
-def _position_rig(model: Model, q_m: tuple[float, float]) -> System:
+def _position_rig(model: laws.Model, q_m: tuple[float, float]) -> System:
     return series(rig_system(model, np.array(q_m)), firmware_sensing(model))
 
 
@@ -784,26 +773,26 @@ def _tuning_rounded(value: float) -> float:
 
 
 def _searched(
-    model: Model,
+    model: laws.Model,
     criterion: ControllerCriterion,
     at: Sequence[tuple[float, float]],
     rigs: Sequence[System],
-    controllers: Callable[[Pid], System],
+    controllers: Callable[[laws.Pid], System],
     integrals_s: Sequence[float],
     most: float,
-    merit: Callable[[Pid], float],
+    merit: Callable[[laws.Pid], float],
 ) -> Tuned:
     omega = frequencies(model.tick_s, 400)
     seen = [response(rig, omega) for rig in rigs]
-    best: list[Pid] = []
+    best: list[laws.Pid] = []
     for Ti in integrals_s:
         for Td in _DERIVATIVE_S.tolist():
-            unit = Pid(1.0, 0.0 if math.isinf(Ti) else 1.0 / Ti, Td, tick_s=model.tick_s)
+            unit = laws.Pid(1.0, 0.0 if math.isinf(Ti) else 1.0 / Ti, Td, tick_s=model.tick_s)
             Kp = _strongest(criterion, response(pid_system(unit), omega)[:, 0, 0], seen, omega, most)
             if Kp > 0.0:
                 Kp = _tuning_rounded(Kp)
                 gains = (_tuning_rounded(Kp * unit.Ki), _tuning_rounded(Kp * Td))
-                best.append(Pid(Kp, *gains, tick_s=model.tick_s))
+                best.append(laws.Pid(Kp, *gains, tick_s=model.tick_s))
     for pid in sorted(best, key=merit, reverse=True):
         worst = [_worst(loop_margins(series(controllers(pid), rig))) for rig in rigs]
         if all(holds(_slack(criterion), one) for one in worst):
@@ -824,7 +813,7 @@ def _slack(criterion: ControllerCriterion) -> ControllerCriterion:
     )
 
 
-def tune_orientation(model: Model, criterion: ControllerCriterion) -> Tuned:
+def tune_orientation(model: laws.Model, criterion: ControllerCriterion) -> Tuned:
     """PID of the angle with the largest Ki [PWM/rad/s].
 
     Raises `BadInputError` where no gains hold the margins.
@@ -834,7 +823,7 @@ def tune_orientation(model: Model, criterion: ControllerCriterion) -> Tuned:
     return _searched(model, criterion, at, rigs, pid_system, _INTEGRAL_S.tolist(), 2e4, lambda pid: pid.Ki)
 
 
-def tune_position(model: Model, criterion: ControllerCriterion) -> Tuned:
+def tune_position(model: laws.Model, criterion: ControllerCriterion) -> Tuned:
     """PD of the lengths with the largest Kp [PWM/m], the firmware's filters in the loop.
 
     Raises `BadInputError` where no gains hold the margins.

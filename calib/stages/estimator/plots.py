@@ -9,20 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.core import plot
 from calib.core.arrays import FloatArray, runs
-from calib.core.plot import (
-    SIGMA,
-    Band,
-    Curve,
-    Figure,
-    Mark,
-    Plot,
-    Ribbon,
-    central,
-    every,
-    short,
-    thinned,
-)
 from calib.stages.estimator.kinematic import OUT
 
 if TYPE_CHECKING:
@@ -44,7 +32,7 @@ _TWO = ("blue", "grey")
 _INNOVATIONS = [OUT.index(name) for _, names, _ in _SENSORS for name in names]
 
 
-def plots(outcome: list[Replayed] | Replayed) -> dict[str, Figure]:
+def plots(outcome: list[Replayed] | Replayed) -> dict[str, plot.Figure]:
     """`replay_<log>_states`, `_innovations` and, with a truth, `_errors` of each log."""
     results, figures = outcome if isinstance(outcome, list) else [outcome], {}
     stems = [Path(one.source).stem for one in results]
@@ -62,31 +50,31 @@ def _named(trace: FloatArray, name: str) -> FloatArray:
     return np.asarray(trace[:, OUT.index(name)])
 
 
-def _figure(title: str, note: str, result: Replayed, panels: Sequence[Plot]) -> Figure:
+def _figure(title: str, note: str, result: Replayed, panels: Sequence[plot.Plot]) -> plot.Figure:
     """Panels over the same time, its name under the last one."""
     t = _named(result.evidence.trace, "t_s")
     shared = [replace(one, x_limits=(float(t[0]), float(t[-1]))) for one in panels]
     shared[-1] = replace(shared[-1], x="time (s)")
-    title = f"{title}: {short(result.source, 78)}"
-    return Figure(title, note, shared, 6.6, result.verdict.word)
+    title = f"{title}: {plot.short(result.source, 78)}"
+    return plot.Figure(title, note, shared, 6.6, result.verdict.word)
 
 
-def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: float = 0.9) -> list[Mark]:
+def _line(t: FloatArray, values: FloatArray, label: str, colour: str, size: float = 0.9) -> list[plot.Mark]:
     known = bool(np.isfinite(values).any())
-    return [Curve(*thinned(t, values), label, "line", colour, size)] if known else []
+    return [plot.Curve(*plot.thinned(t, values), label, "line", colour, size)] if known else []
 
 
-def _states(result: Replayed) -> Figure:
+def _states(result: Replayed) -> plot.Figure:
     """Lengths and angle over time with their bands, the baseline and the truth where it is known."""
     trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = (
-        f"Blue is the estimate with its 2{SIGMA} band, orange the source's pipeline with its 1 Hz low-pass, "
-        "black the truth, where the log knows it. Red marks are pictures that were gated out."
+        f"Blue is the estimate with its 2{plot.SIGMA} band, orange the source's pipeline with its 1 Hz "
+        "low-pass, black the truth, where the log knows it. Red marks are pictures that were gated out."
     )
     gated = _named(trace, "gated_camera") == 1.0
     # NaN where there is no driven model.
     kinematic = _named(trace, "driven_weight") < 0.5
-    stretches = [Band("x", t[i], t[j - 1], colour="ochre") for i, j in runs(kinematic)]
+    stretches = [plot.Band("x", t[i], t[j - 1], colour="ochre") for i, j in runs(kinematic)]
     if stretches:
         note += " Where it is shaded the kinematic model speaks."
     panels = []
@@ -94,51 +82,59 @@ def _states(result: Replayed) -> Figure:
         value, spread = factor * _named(trace, name), 2.0 * factor * _named(trace, sigma)
         marks = [
             *stretches,
-            Ribbon(every(t), every(value - spread), every(value + spread)),
+            plot.Ribbon(plot.every(t), plot.every(value - spread), plot.every(value + spread)),
             *_line(t, factor * trace[:, _BASELINE + k], "baseline", "orange"),
             *_line(t, factor * trace[:, _TRUTH + k], "truth", "ink", 1.4),
             *_line(t, value, "estimate", "blue"),
         ]
         if gated.any():
-            marks.append(Curve(every(t[gated]), every(value[gated]), "gated picture", "marks", "red", 6.0))
+            marks.append(
+                plot.Curve(
+                    plot.every(t[gated]), plot.every(value[gated]), "gated picture", "marks", "red", 6.0
+                )
+            )
         # The bands of the start would press all else flat.
-        panels.append(Plot("", y, marks, y_limits=central(value, 0.5, 0.25)))
+        panels.append(plot.Plot("", y, marks, y_limits=plot.central(value, 0.5, 0.25)))
     return _figure("States", note, result, panels)
 
 
-def _innovations(result: Replayed) -> Figure:
+def _innovations(result: Replayed) -> plot.Figure:
     """Innovations of each sensor over their standard deviation, gated ones marked."""
     trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
     note = (
-        f"An honest covariance keeps 95 % within the grey band of 2{SIGMA}, without a pattern. "
+        f"An honest covariance keeps 95 % within the grey band of 2{plot.SIGMA}, without a pattern. "
         "Red ones were gated out and not used; marks at the edge lie beyond it."
     )
     panels = []
     for y, names, gate in _SENSORS:
-        marks: list[Mark] = [Band("y", -2.0, 2.0)]
+        marks: list[plot.Mark] = [plot.Band("y", -2.0, 2.0)]
         gated = _named(trace, gate) == 1.0
         for name, colour in zip(names, _TWO, strict=False):
             value = np.clip(_named(trace, name), -5.8, 5.8)
-            some = every(np.flatnonzero(~gated & np.isfinite(value)))
-            marks.append(Curve(t[some], value[some], kind="cloud", colour=colour))
-            marks.append(Curve(t[gated], value[gated], kind="crosses", colour="red"))
+            some = plot.every(np.flatnonzero(~gated & np.isfinite(value)))
+            marks.append(plot.Curve(t[some], value[some], kind="cloud", colour=colour))
+            marks.append(plot.Curve(t[gated], value[gated], kind="crosses", colour="red"))
         empty = "" if np.isfinite(_named(trace, names[0])).any() else "not sampled"
-        panels.append(Plot("", y, marks, y_limits=(-6.0, 6.0), grid="y", empty=empty))
+        panels.append(plot.Plot("", y, marks, y_limits=(-6.0, 6.0), grid="y", empty=empty))
     return _figure("Innovations", note, result, panels)
 
 
-def _errors(result: Replayed) -> Figure:
+def _errors(result: Replayed) -> plot.Figure:
     """Errors against the truth with the 2-sigma band, the baseline's beside them."""
     trace, t = result.evidence.trace, _named(result.evidence.trace, "t_s")
-    note = f"Grey is 2{SIGMA} of the estimate, blue its error, orange the error of the source's pipeline."
+    note = (
+        f"Grey is 2{plot.SIGMA} of the estimate, blue its error, orange the error of the source's pipeline."
+    )
     panels = []
     for k, (y, name, sigma, factor) in enumerate(_QUANTITIES):
-        truth, spread = trace[:, _TRUTH + k], 2.0 * factor * every(_named(trace, sigma))
+        truth, spread = trace[:, _TRUTH + k], 2.0 * factor * plot.every(_named(trace, sigma))
         other, error = factor * (trace[:, _BASELINE + k] - truth), factor * (_named(trace, name) - truth)
         marks = [
-            Ribbon(every(t), -spread, spread),
+            plot.Ribbon(plot.every(t), -spread, spread),
             *_line(t, other, "baseline", "orange"),
             *_line(t, error, "estimate", "blue"),
         ]
-        panels.append(Plot("", y, marks, y_limits=central(np.concatenate([error, other]), 0.5, 0.25)))
+        panels.append(
+            plot.Plot("", y, marks, y_limits=plot.central(np.concatenate([error, other]), 0.5, 0.25))
+        )
     return _figure("Errors", note, result, panels)

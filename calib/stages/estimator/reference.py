@@ -14,17 +14,8 @@ from typing import Any
 import numpy as np
 
 from calib.core.arrays import FloatArray
+from calib.stages.estimator import kinematic
 from calib.stages.estimator.event import CAMERA, camera_terms, imu_terms, stamp_variance
-from calib.stages.estimator.kinematic import (
-    CONSIDERED,
-    LARGEST_STEP_S,
-    OUT,
-    Rows,
-    Setup,
-    axis_noise,
-    starting_state,
-    write_columns,
-)
 from calib.stages.estimator.sensors import SIZE, update_terms
 from calib.stages.estimator.smoother import Events, events_of, one_level, transition
 
@@ -34,10 +25,10 @@ def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
     Q, F, part = np.zeros((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.zeros((SIZE, SIZE))
     if not dt > 0.0:
         return Q
-    parts = max(math.ceil(dt / LARGEST_STEP_S - 1e-9), 1)
+    parts = max(math.ceil(dt / kinematic.LARGEST_STEP_S - 1e-9), 1)
     transition(level, dt / parts, F)
     for axis in range(2):
-        pp, pv, pa, vv, va, aa = axis_noise(level[4 * axis + 2], level[4 * axis + 3], dt / parts)
+        pp, pv, pa, vv, va, aa = kinematic.axis_noise(level[4 * axis + 2], level[4 * axis + 3], dt / parts)
         rows = [axis, axis + 2, axis + 4]
         part[np.ix_(rows, rows)] = [[pp, pv, pa], [pv, vv, va], [pa, va, aa]]
     part[range(6, SIZE), range(6, SIZE)] = walk * dt / parts
@@ -47,7 +38,7 @@ def process_noise(level: FloatArray, walk: FloatArray, dt: float) -> FloatArray:
 
 
 def scalar_readings(
-    setup: Setup, kind: int, z: FloatArray, x: FloatArray, P: FloatArray
+    setup: kinematic.Setup, kind: int, z: FloatArray, x: FloatArray, P: FloatArray
 ) -> list[tuple[float, float, FloatArray, float, bool]]:
     """Each reading of an event: value, prediction, gradient, variance of its noise, whether rounded."""
     noise, out = setup.noise, np.empty(SIZE)
@@ -59,7 +50,9 @@ def scalar_readings(
     return [(z[k], out[k], H[k].copy(), out[3 + k], False) for k in (2, 0, 1) if not math.isnan(z[k])]
 
 
-def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tuple[FloatArray, FloatArray]:
+def extended(
+    setup: kinematic.Setup, rows: kinematic.Rows, events: Events, gated: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """States (n, 20) and covariances (n, 20, 20) after each event, by filterpy's EKF.
 
     Parameters
@@ -69,10 +62,10 @@ def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tup
     from filterpy.kalman import ExtendedKalmanFilter
 
     levels, walk = setup.process.arrays()
-    start_x, start_P, _ = starting_state(setup, rows)
+    start_x, start_P, _ = kinematic.starting_state(setup, rows)
     ekf: Any = ExtendedKalmanFilter(dim_x=SIZE, dim_z=1)
     ekf.x, ekf.P = start_x[0].copy(), start_P[0].copy()
-    held = list(CONSIDERED)
+    held = list(kinematic.CONSIDERED)
     n = len(events.t_s)
     x, P, F = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE)), np.empty((SIZE, SIZE))
     for k in range(n):
@@ -107,7 +100,7 @@ def extended(setup: Setup, rows: Rows, events: Events, gated: FloatArray) -> tup
     return x, P
 
 
-def replayed(setup: Setup, rows: Rows) -> tuple[FloatArray, float]:
+def replayed(setup: kinematic.Setup, rows: kinematic.Rows) -> tuple[FloatArray, float]:
     """Estimates (n, len(OUT)) of `extended` at the rows' stamps, and how far the compiled filter is away.
 
     The last level of process noise alone follows any motion. Pictures stand at their exposure and wait for
@@ -119,9 +112,9 @@ def replayed(setup: Setup, rows: Rows) -> tuple[FloatArray, float]:
     ours = one_level(setup, rows, events)
     x, P = extended(setup, rows, events, ours.gated)
     own = events.kinds == 0
-    out = np.full((len(rows), len(OUT)), np.nan)
-    out[:, 0], out[:, OUT.index("flags")] = rows.t_s, 0.0
-    write_columns(x[own], P[own], 6, events.rows[own], setup.bellows_radius_m, out)
+    out = np.full((len(rows), len(kinematic.OUT)), np.nan)
+    out[:, 0], out[:, kinematic.OUT.index("flags")] = rows.t_s, 0.0
+    kinematic.write_columns(x[own], P[own], 6, events.rows[own], setup.bellows_radius_m, out)
     sigma = np.sqrt(np.diagonal(ours.P, axis1=1, axis2=2))
     apart = np.abs((x - ours.x) / sigma).max()
     return out, float(max(apart, np.abs((P - ours.P) / (sigma[:, :, None] * sigma[:, None, :])).max()))

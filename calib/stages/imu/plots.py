@@ -7,29 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.core import plot
 from calib.core.arrays import FloatArray, blocks
-from calib.core.plot import (
-    SIGMA,
-    Band,
-    Bars,
-    Colour,
-    Curve,
-    Field,
-    Figure,
-    Mark,
-    Plot,
-    Ribbon,
-    Rule,
-    Shape,
-    Text,
-    circle,
-    every,
-    judged,
-    number,
-    short,
-    spaced,
-    thinned,
-)
 from calib.stages.imu.allan import model_variance
 from calib.stages.imu.drift import LogDrift
 from calib.stages.imu.intrinsics import Accelerometer, Intrinsics
@@ -54,13 +33,13 @@ _NAMES = {"g": f"rate ({_UNITS['g'][1]})", "a": f"specific force ({_UNITS['a'][1
 _TAU = "\N{GREEK SMALL LETTER TAU}"
 
 
-def static_plots(imu: Imu) -> dict[str, Figure]:
+def static_plots(imu: Imu) -> dict[str, plot.Figure]:
     """`imu_allan`, `imu_drift`, and `imu_static_1`, ... for each log."""
     result: Static = imu.evidence
     figures = {"imu_allan": _allan(result), "imu_drift": _drift(result)}
     for i, log in enumerate(result.logs, start=1):
         figures[f"imu_static_{i}"] = _readings(result.axes, log)
-    return judged(figures, imu.verdict.word)
+    return plot.judged(figures, imu.verdict.word)
 
 
 def _by_axis(axes: Sequence[str]) -> tuple[str, ...]:
@@ -75,68 +54,70 @@ def _y(axis: str) -> str:
     return _NAMES[axis[0]] if axis[1] == "x" else ""
 
 
-def _allan(result: Static) -> Figure:
+def _allan(result: Static) -> plot.Figure:
     """Overlapping Allan deviation of each axis, its 1-sigma bounds, and the fitted N, B and K."""
     note = (
-        f"Grey bands are 1{SIGMA} bounds. White noise N falls with the root of the averaging time {_TAU}, "
-        "bias instability B is level, a random walk K of the bias rises. A line is drawn for what the logs "
-        "show; \N{LESS-THAN SIGN} marks a bound of 95 % for what they are too short for."
+        f"Grey bands are 1{plot.SIGMA} bounds. White noise N falls with the root of the averaging time "
+        f"{_TAU}, bias instability B is level, a random walk K of the bias rises. A line is drawn for "
+        "what the logs show; \N{LESS-THAN SIGN} marks a bound of 95 % for what they are too short for."
     )
     mosaic = _by_axis(result.axes)
     panels = tuple(_deviation(noise) for noise in result.noise)
-    return Figure("Allan deviation at rest", note, panels, 2.75 * len(mosaic) + 0.25, mosaic=mosaic)
+    return plot.Figure("Allan deviation at rest", note, panels, 2.75 * len(mosaic) + 0.25, mosaic=mosaic)
 
 
-def _deviation(noise: AxisNoise) -> Plot:
+def _deviation(noise: AxisNoise) -> plot.Plot:
     """Allan deviation of one axis; what was fitted stands in the corner."""
     x, y = f"{_TAU} (s)", _y(noise.axis)
     a = noise.allan
     if a is None:
-        return Plot(x, y, title=noise.axis, empty="never changes")
-    marks: list[Mark] = [Ribbon(a.tau_s, a.low, a.high)]
+        return plot.Plot(x, y, title=noise.axis, empty="never changes")
+    marks: list[plot.Mark] = [plot.Ribbon(a.tau_s, a.low, a.high)]
     parts = np.sqrt(model_variance(a.theta, a.tau_s))
     words = []
     terms = (("N", a.N, "blue"), ("B", a.B, "green"), ("K", a.K, "red"))
     for k, ((name, term, hue), unit) in enumerate(zip(terms, _UNITS[noise.axis[0]], strict=True)):
         if a.theta[k] > 0.0:
-            marks.append(Curve(a.tau_s, parts[:, k], name, "dashed", hue, 1.1))
-        bound = f"< {number(term.below, unit, 2)}"
-        words.append(f"{name} {number(term.value, unit) if term.supported else bound}")
+            marks.append(plot.Curve(a.tau_s, parts[:, k], name, "dashed", hue, 1.1))
+        bound = f"< {plot.number(term.below, unit, 2)}"
+        words.append(f"{name} {plot.number(term.value, unit) if term.supported else bound}")
     some = (a.tau_s >= 0.999 * a.fit_s[0]) & (a.tau_s <= 1.001 * a.fit_s[1])
     whole = np.sqrt((parts**2).sum(axis=1))
-    marks.append(Curve(a.tau_s[some], whole[some], "fitted", colour="orange", size=2.2))
-    marks.append(Curve(a.tau_s, a.deviation, "measured", colour="ink", size=1.2))
+    marks.append(plot.Curve(a.tau_s[some], whole[some], "fitted", colour="orange", size=2.2))
+    marks.append(plot.Curve(a.tau_s, a.deviation, "measured", colour="ink", size=1.2))
     limits = (float(np.nanmin(a.low)) / 12.0, 1.6 * float(np.nanmax(a.high)))
-    return Plot(x, y, marks, noise.axis, y_limits=limits, log="xy", corner="\n".join(words))
+    return plot.Plot(x, y, marks, noise.axis, y_limits=limits, log="xy", corner="\n".join(words))
 
 
-def _readings(axes: Sequence[str], log: StaticLog) -> Figure:
+def _readings(axes: Sequence[str], log: StaticLog) -> plot.Figure:
     """Readings of one log over time, means over a second, and where it moves."""
     moved = len(log.motions)
     note = "Grey are the readings, as the extremes of each bin, blue their means over a second. " + (
         "Red stretches were taken for motion and left out." if moved else "No motion was found."
     )
     period, zero = log.sampling.period_s, float(log.parts[0].t_s[0])
-    bands = [Band("x", one.from_s - zero, one.to_s - zero, colour="peach") for one in log.motions]
+    bands = [plot.Band("x", one.from_s - zero, one.to_s - zero, colour="peach") for one in log.motions]
     size = max(1, round(1.0 / period))
     panels = []
     for k, axis in enumerate(axes):
-        marks: list[Mark] = list(bands)
+        marks: list[plot.Mark] = list(bands)
         for part in log.parts:
-            marks.append(Curve(*thinned(part.t_s - zero, part.values[:, k]), colour="silver", size=0.5))
+            marks.append(
+                plot.Curve(*plot.thinned(part.t_s - zero, part.values[:, k]), colour="silver", size=0.5)
+            )
             means = blocks(part.values[:, k], size).mean(axis=1)
             middle = part.t_s[0] - zero + period * size * (np.arange(len(means)) + 0.5)
-            marks.append(Curve(middle, means, size=1.0))
-        panels.append(Plot("time (s)", _y(axis), marks, axis))
-    title, mosaic = f"Readings at rest: {short(log.source, 70)}", _by_axis(axes)
-    return Figure(title, note, panels, 2.2 * len(mosaic), mosaic=mosaic)
+            marks.append(plot.Curve(middle, means, size=1.0))
+        panels.append(plot.Plot("time (s)", _y(axis), marks, axis))
+    title, mosaic = f"Readings at rest: {plot.short(log.source, 70)}", _by_axis(axes)
+    return plot.Figure(title, note, panels, 2.2 * len(mosaic), mosaic=mosaic)
 
 
-def _drift(result: Static) -> Figure:
+def _drift(result: Static) -> plot.Figure:
     """Drift of the angle in each log, by the gyroscope and by the chip (Fig. 2.4)."""
     note = (
-        f"These are the slopes of -gz integrated and of the angle that the chip reports, with 2{SIGMA}. The "
-        "line is the mean of the logs, the band their standard deviation. A slope does not rank filters."
+        f"These are the slopes of -gz integrated and of the angle that the chip reports, with 2{plot.SIGMA}. "
+        "The line is the mean of the logs, the band their standard deviation. A slope does not rank filters."
     )
     panels = []
     for title, drifts in (
@@ -145,21 +126,21 @@ def _drift(result: Static) -> Figure:
     ):
         have = [(i, drift) for i, drift in enumerate(drifts, start=1) if drift is not None]
         if not have:
-            panels.append(Plot("log", title=title, empty="not logged, or the logs move"))
+            panels.append(plot.Plot("log", title=title, empty="not logged, or the logs move"))
             continue
         at = np.array([i for i, _ in have])
         slope = np.degrees([drift.slope_radps for _, drift in have])
         sigma = np.nan_to_num(np.degrees([drift.sigma_radps for _, drift in have]))
         mean, spread = float(slope.mean()), float(slope.std(ddof=1)) if len(have) > 1 else 0.0
         marks = (
-            Band("y", mean - spread, mean + spread),
-            Rule("y", mean),
-            Rule("y", 0.0, "ink"),
-            Curve(at, slope, kind="points", size=7.0, spread=2.0 * sigma),
+            plot.Band("y", mean - spread, mean + spread),
+            plot.Rule("y", mean),
+            plot.Rule("y", 0.0, "ink"),
+            plot.Curve(at, slope, kind="points", size=7.0, spread=2.0 * sigma),
         )
         limits = (0.4, len(drifts) + 0.6)
-        panels.append(Plot("log", "slope (degrees/s)", marks, title, limits, whole="x", grid="y"))
-    return Figure("Drift of the angle, log by log", note, panels, 3.4, columns=2)
+        panels.append(plot.Plot("log", "slope (degrees/s)", marks, title, limits, whole="x", grid="y"))
+    return plot.Figure("Drift of the angle, log by log", note, panels, 3.4, columns=2)
 
 
 # ----------------------------------------------------------------------
@@ -169,13 +150,15 @@ _MMPS2 = "mm/s\N{SUPERSCRIPT TWO}"
 _DEGREE = "\N{DEGREE SIGN}"
 
 
-def intrinsics_plots(section: ImuIntrinsics) -> dict[str, Figure]:
+def intrinsics_plots(section: ImuIntrinsics) -> dict[str, plot.Figure]:
     """`imu_poses` and `imu_residuals`."""
     result: Intrinsics = section.evidence
-    return judged({"imu_poses": _poses(result), "imu_residuals": _residuals(result)}, section.verdict.word)
+    return plot.judged(
+        {"imu_poses": _poses(result), "imu_residuals": _residuals(result)}, section.verdict.word
+    )
 
 
-def _poses(result: Intrinsics) -> Figure:
+def _poses(result: Intrinsics) -> plot.Figure:
     """Which way was up in each rest, in the sensor's frame."""
     note = (
         f"Each point is a rest: the direction in the sensor's frame that was up. {len(result.rests)} rests "
@@ -183,17 +166,17 @@ def _poses(result: Intrinsics) -> Figure:
     )
     if not result.planar:
         note += f" Rings are 30{_DEGREE}, 60{_DEGREE} and 90{_DEGREE} from the z axis; areas are true."
-    panels: tuple[Plot, ...]
+    panels: tuple[plot.Plot, ...]
     if result.accel is None:
-        panels = (Plot(empty="too few rests to tell their poses"),)
+        panels = (plot.Plot(empty="too few rests to tell their poses"),)
     elif result.planar:
         panels = (_disc(result.accel.directions, (90.0,), "", "In the plane of x and y"),)
     else:
         panels = tuple(_half(result.accel, sign) for sign in (1.0, -1.0))
-    return Figure("Poses of the IMU", note, panels, 4.3, columns=len(panels))
+    return plot.Figure("Poses of the IMU", note, panels, 4.3, columns=len(panels))
 
 
-def _half(accel: Accelerometer, sign: float) -> Plot:
+def _half(accel: Accelerometer, sign: float) -> plot.Plot:
     """The half of the sphere with z up or down, in Lambert's equal-area projection."""
     u = accel.directions
     here = u[u[:, 2] > 0.0] if sign > 0.0 else u[u[:, 2] <= 0.0]
@@ -202,63 +185,65 @@ def _half(accel: Accelerometer, sign: float) -> Plot:
     return _disc(at, (90.0, 60.0, 30.0), "z" if sign > 0.0 else "-z", f"z axis {words}: {len(here)} rests")
 
 
-def _disc(at: FloatArray, rings_deg: Sequence[float], centre: str, title: str) -> Plot:
+def _disc(at: FloatArray, rings_deg: Sequence[float], centre: str, title: str) -> plot.Plot:
     """Points (n, 2) on a disc of radius 1 with rings at these angles from its centre."""
-    marks: list[Mark] = []
+    marks: list[plot.Mark] = []
     for degrees in rings_deg:
         radius = math.sqrt(2.0) * math.sin(math.radians(degrees) / 2.0)
-        marks.append(Shape(circle(0.0, 0.0, radius), "shade" if degrees == 90.0 else None, "silver"))
+        marks.append(
+            plot.Shape(plot.circle(0.0, 0.0, radius), "shade" if degrees == 90.0 else None, "silver")
+        )
     for name, x, y in (("x", 1, 0), ("-x", -1, 0), ("y", 0, 1), ("-y", 0, -1), (centre, 0.03, 0.03)):
-        marks.append(Text(1.12 * x, 1.12 * y, name, "grey"))
-    marks.append(Curve(at[:, 0], at[:, 1], kind="points", size=6.0))
-    return Plot("", "", marks, title, (-1.25, 1.25), (-1.25, 1.25), equal=True, bare=True)
+        marks.append(plot.Text(1.12 * x, 1.12 * y, name, "grey"))
+    marks.append(plot.Curve(at[:, 0], at[:, 1], kind="points", size=6.0))
+    return plot.Plot("", "", marks, title, (-1.25, 1.25), (-1.25, 1.25), equal=True, bare=True)
 
 
-def _residuals(result: Intrinsics) -> Figure:
+def _residuals(result: Intrinsics) -> plot.Figure:
     """What rests and turns are off by, and the threshold that was taken."""
-    note = f"Bars are 2{SIGMA} of a rest. "
+    note = f"Bars are 2{plot.SIGMA} of a rest. "
     if result.accel is not None:
-        rms = number(1e3 * result.accel.rms_mps2, _MMPS2)
+        rms = plot.number(1e3 * result.accel.rms_mps2, _MMPS2)
         note += f"The rests differ from g by {rms} (RMS). Red are the threshold taken and the turns' RMS."
     panels = (_rests(result), _thresholds(result), _turns(result))
-    return Figure("Residuals of rests and turns", note, panels, 5.4, mosaic=("AA", "BC"))
+    return plot.Figure("Residuals of rests and turns", note, panels, 5.4, mosaic=("AA", "BC"))
 
 
-def _rests(result: Intrinsics) -> Plot:
+def _rests(result: Intrinsics) -> plot.Plot:
     accel, x, y = result.accel, "time (s)", f"residual ({_MMPS2})"
     title = "Length of the specific force less g, rest by rest"
     if accel is None:
-        return Plot(x, y, title=title, empty="too few rests for a fit")
+        return plot.Plot(x, y, title=title, empty="too few rests for a fit")
     at = np.array([0.5 * (rest.from_s + rest.to_s) for rest in result.rests])
-    points = Curve(at, 1e3 * accel.residual_mps2, kind="points", spread=2e3 * accel.deviation_mps2)
-    return Plot(x, y, (Rule("y", 0.0, "ink"), points), title, grid="y")
+    points = plot.Curve(at, 1e3 * accel.residual_mps2, kind="points", spread=2e3 * accel.deviation_mps2)
+    return plot.Plot(x, y, (plot.Rule("y", 0.0, "ink"), points), title, grid="y")
 
 
-def _thresholds(result: Intrinsics) -> Plot:
+def _thresholds(result: Intrinsics) -> plot.Plot:
     title, x, y = "Threshold by residual", "multiple of the spread at rest", f"residual RMS ({_MMPS2})"
     tried = [
         (trial.multiple, 1e3 * trial.rms_mps2) for trial in result.trials if math.isfinite(trial.rms_mps2)
     ]
     if not tried:
-        return Plot(x, y, title=title, empty="too few rests to compare thresholds")
+        return plot.Plot(x, y, title=title, empty="too few rests to compare thresholds")
     multiple, rms = np.array(tried).T
     taken = multiple == result.multiple
     marks = (
-        Curve(multiple, rms, colour="ink", size=1.0),
-        Curve(multiple, rms, kind="points", colour="ink"),
-        Curve(multiple[taken], rms[taken], kind="points", colour="red", size=8.0),
+        plot.Curve(multiple, rms, colour="ink", size=1.0),
+        plot.Curve(multiple, rms, kind="points", colour="ink"),
+        plot.Curve(multiple[taken], rms[taken], kind="points", colour="red", size=8.0),
     )
-    return Plot(x, y, marks, title, y_limits=(0.0, 1.15 * float(rms.max())))
+    return plot.Plot(x, y, marks, title, y_limits=(0.0, 1.15 * float(rms.max())))
 
 
-def _turns(result: Intrinsics) -> Plot:
+def _turns(result: Intrinsics) -> plot.Plot:
     title, x, y = "Gravity missed after each turn", "turn", "angle (degrees)"
     if result.gyro is None:
-        return Plot(x, y, title=title, empty="no gyroscope, or no turn")
+        return plot.Plot(x, y, title=title, empty="no gyroscope, or no turn")
     missed = np.degrees(np.linalg.norm(result.gyro.residual_rad, axis=1))
-    bars = Bars(np.arange(1, len(missed) + 1), missed, 0.7)
-    rms = Rule("y", math.degrees(result.gyro.rms_rad), "red")
-    return Plot(x, y, (bars, rms), title, whole="x", grid="y")
+    bars = plot.Bars(np.arange(1, len(missed) + 1), missed, 0.7)
+    rms = plot.Rule("y", math.degrees(result.gyro.rms_rad), "red")
+    return plot.Plot(x, y, (bars, rms), title, whole="x", grid="y")
 
 
 # ----------------------------------------------------------------------
@@ -279,7 +264,7 @@ _MOST_IN_LEGEND = 8
 _PM = "\N{PLUS-MINUS SIGN}"
 
 
-def drift_plots(drift: Drift) -> dict[str, Figure]:
+def drift_plots(drift: Drift) -> dict[str, plot.Figure]:
     """`drift_angles`, `drift_slopes` where there are any, and `drift_motion_1`, ... for logs that move."""
     logs: Sequence[LogDrift] = drift.evidence
     figures = {"drift_angles": _angles(logs)}
@@ -289,11 +274,11 @@ def drift_plots(drift: Drift) -> dict[str, Figure]:
     return figures | {name: _in_motion(log) for name, log in moving.items()}
 
 
-def _colours(logs: Sequence[LogDrift]) -> list[Colour]:
-    return list(spaced(len(logs)).tolist()) if len(logs) > 1 else ["blue"]
+def _colours(logs: Sequence[LogDrift]) -> list[plot.Colour]:
+    return list(plot.spaced(len(logs)).tolist()) if len(logs) > 1 else ["blue"]
 
 
-def _angles(logs: Sequence[LogDrift]) -> Figure:
+def _angles(logs: Sequence[LogDrift]) -> plot.Figure:
     """Angles since each log's start, a panel for each method and a line for each log (Fig. 2.4)."""
     names = list(dict.fromkeys(track.name for log in logs for track in log.tracks))
     note = (
@@ -309,14 +294,14 @@ def _angles(logs: Sequence[LogDrift]) -> Figure:
             for mark in _change(log, name, hue, len(logs))
         )
         empty = "" if marks else "nothing to draw"
-        panels.append(Plot("time (s)", "" if i % 3 else "angle (degrees)", marks, name, empty=empty))
+        panels.append(plot.Plot("time (s)", "" if i % 3 else "angle (degrees)", marks, name, empty=empty))
     high = 2.1 * -(-len(names) // 3) + (0.3 if len(logs) > 1 else 0.0)
-    return Figure("Drift of the angle", note, panels, high, columns=3)
+    return plot.Figure("Drift of the angle", note, panels, high, columns=3)
 
 
-def _change(log: LogDrift, name: str, colour: Colour, logs: int) -> list[Curve]:
+def _change(log: LogDrift, name: str, colour: plot.Colour, logs: int) -> list[plot.Curve]:
     """Change of the angle by one method in each part of a log."""
-    curves: list[Curve] = []
+    curves: list[plot.Curve] = []
     first = None
     period = log.period_s
     for phi_rad in (track.phi_rad for track in log.tracks if track.name == name):
@@ -326,19 +311,19 @@ def _change(log: LogDrift, name: str, colour: Colour, logs: int) -> list[Curve]:
             if len(known):
                 first = float(np.mean(known[: max(round(1.0 / period), 1)])) if first is None else first
                 t = log.start_s[k] - log.start_s[0] + period * np.arange(len(change))
-                label = short(log.section.name, 24) if k == 0 and 1 < logs <= _MOST_IN_LEGEND else ""
-                curves.append(Curve(*thinned(t, change - first), label, colour=colour, size=1.0))
+                label = plot.short(log.section.name, 24) if k == 0 and 1 < logs <= _MOST_IN_LEGEND else ""
+                curves.append(plot.Curve(*plot.thinned(t, change - first), label, colour=colour, size=1.0))
     return curves
 
 
-def _slopes(logs: Sequence[LogDrift]) -> Figure:
+def _slopes(logs: Sequence[LogDrift]) -> plot.Figure:
     """Slope of each method in each log with its interval."""
     names = list(dict.fromkeys(name for log in logs for name in log.section.methods))
     note = (
         "These are the slopes of the angle's error in each log, with 95 % intervals, from the first log at "
         f"the top to the last. The scale is linear within {_PM}0.01 degrees/s and logarithmic beyond."
     )
-    marks: list[Mark] = [Rule("x", 0.0, "ink")]
+    marks: list[plot.Mark] = [plot.Rule("x", 0.0, "ink")]
     for j, (log, hue) in enumerate(zip(logs, _colours(logs), strict=True)):
         have = {name: m for name, m in log.section.methods.items() if m.slope_degps is not None}
         at = np.array([names.index(name) for name in have]) + 0.6 * ((j + 0.5) / len(logs) - 0.5)
@@ -346,10 +331,10 @@ def _slopes(logs: Sequence[LogDrift]) -> Figure:
         # A log that never rests shows no slope.
         ends = np.array([m.interval_degps for m in have.values()], dtype=np.float64).reshape(-1, 2)
         half = np.nan_to_num(0.5 * np.ptp(ends, axis=1))
-        marks.append(Curve(value, at, kind="points", colour=hue, spread=half, across=True))
+        marks.append(plot.Curve(value, at, kind="points", colour=hue, spread=half, across=True))
     x = "slope (degrees/s)"
-    panel = Plot(x, "", marks, log="x", linear_within=0.01, grid="x", names=tuple(names))
-    return Figure("Slope by method", note, (panel,), 0.9 + 0.34 * len(names))
+    panel = plot.Plot(x, "", marks, log="x", linear_within=0.01, grid="x", names=tuple(names))
+    return plot.Figure("Slope by method", note, (panel,), 0.9 + 0.34 * len(names))
 
 
 def _liveliest(log: LogDrift) -> tuple[int, slice]:
@@ -366,7 +351,7 @@ def _liveliest(log: LogDrift) -> tuple[int, slice]:
     return best
 
 
-def _in_motion(log: LogDrift) -> Figure:
+def _in_motion(log: LogDrift) -> plot.Figure:
     """Angles of sensors and filters while the log moves most, and their errors (Fig. 2.6)."""
     note = "These twelve seconds move most. Below is the error against the true angle, less its mean there."
     truth = log.truth_rad
@@ -376,8 +361,8 @@ def _in_motion(log: LogDrift) -> Figure:
     t = log.start_s[k] - log.start_s[0] + log.period_s * np.arange(where.start, where.stop)
     tracks = {track.name: np.degrees(track.phi_rad[k][where]) for track in log.tracks}
     against = tracks["MM 3/3"] if truth is None else np.degrees(truth[k][where])
-    above: list[Mark] = []
-    below: list[Mark] = []
+    above: list[plot.Mark] = []
+    below: list[plot.Mark] = []
     for name, (hue, size) in _METHODS.items():
         if name in tracks:
             turns = 360.0 * np.rint(np.nanmedian(tracks[name] - tracks["MM 3/3"]) / 360.0)
@@ -385,18 +370,18 @@ def _in_motion(log: LogDrift) -> Figure:
             error = degrees - against
             if truth is not None and np.isfinite(error).any():
                 error = error - np.nanmean(error)
-            above.append(Curve(t, degrees, name, colour=hue, size=size))
+            above.append(plot.Curve(t, degrees, name, colour=hue, size=size))
             if truth is not None or name != "MM 3/3":
-                below.append(Curve(t, error, colour=hue, size=size))
+                below.append(plot.Curve(t, error, colour=hue, size=size))
     if truth is not None:
-        above.append(Curve(t, against, "truth", "dashed", "ink", 1.0))
+        above.append(plot.Curve(t, against, "truth", "dashed", "ink", 1.0))
     limits = (float(t[0]), float(t[-1]))
     y = "error (degrees)" if truth is not None else "difference (degrees)"
     panels = (
-        Plot("", "angle (degrees)", above, x_limits=limits),
-        Plot("time (s)", y, below, x_limits=limits),
+        plot.Plot("", "angle (degrees)", above, x_limits=limits),
+        plot.Plot("time (s)", y, below, x_limits=limits),
     )
-    return Figure(f"In motion: {short(log.section.name, 78)}", note, panels, 4.9)
+    return plot.Figure(f"In motion: {plot.short(log.section.name, 78)}", note, panels, 4.9)
 
 
 # ----------------------------------------------------------------------
@@ -405,16 +390,16 @@ def _in_motion(log: LogDrift) -> Figure:
 _PAIRS = {"3/3": ("red", "squares"), "tuned": ("green", "points"), "riccati": ("orange", "diamonds")}
 
 
-def tune_plots(section: OrientationFilter) -> dict[str, Figure]:
+def tune_plots(section: OrientationFilter) -> dict[str, plot.Figure]:
     """`tune_gains` and `tune_errors`."""
     result, pieces = section.evidence
     figures = {"tune_gains": _gains(result), "tune_errors": _tuning_errors(result, pieces)}
-    return judged(figures, section.verdict.word)
+    return plot.judged(figures, section.verdict.word)
 
 
-def _gains(result: Tuning) -> Figure:
+def _gains(result: Tuning) -> plot.Figure:
     """Error on the whole logs over Kp and Ki, and where the pairs that are compared lie."""
-    marks: list[Mark] = []
+    marks: list[plot.Mark] = []
     above, s = "nothing to judge by", result.surface
     if s is not None:
         Kp = np.repeat(s.Kp[:, None], len(s.damping), axis=1)
@@ -423,19 +408,19 @@ def _gains(result: Tuning) -> Figure:
         least = float(np.nanmin(error))
         levels = least * np.geomspace(1.0, 8.0, 13)
         error = np.clip(np.where(np.isfinite(error), error, np.inf), None, levels[-1])
-        marks.append(Field(Kp, Ki, error, levels=levels, outlined=levels[1:2]))
+        marks.append(plot.Field(Kp, Ki, error, levels=levels, outlined=levels[1:2]))
         above = f"Least {least:.3f} deg; line: 19 % more"
     for one in result.candidates:
         if isinstance(one.gains, Mahony):
             (hue, kind), gains = _PAIRS[one.name], one.gains
             at = np.array([gains.Kp]), np.array([max(gains.Ki, 1e-9)])
-            marks.append(Curve(*at, one.name, kind, hue, 8.0))
-    panel = Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", marks, above, log="xy")
+            marks.append(plot.Curve(*at, one.name, kind, hue, 8.0))
+    panel = plot.Plot("Kp (1/s)", "Ki (1/s\N{SUPERSCRIPT TWO})", marks, above, log="xy")
     title = f"Gains of the angle filter: {result.recommended.name}"
-    return Figure(title, "The map is the error on the whole logs by pair of gains.", (panel,), 4.3)
+    return plot.Figure(title, "The map is the error on the whole logs by pair of gains.", (panel,), 4.3)
 
 
-def _tuning_errors(result: Tuning, pieces: Sequence[Piece]) -> Figure:
+def _tuning_errors(result: Tuning, pieces: Sequence[Piece]) -> plot.Figure:
     """Angle of the longest piece, and the errors of 3/3 and of the tuned filters."""
     k = int(np.argmax([len(piece.t_s) for piece in pieces]))
     piece, own = pieces[k], result.smoothed[k]
@@ -446,12 +431,12 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece]) -> Figure:
     else:
         target, by = np.full(len(piece.t_s), np.nan), "nothing"
     t = piece.t_s
-    measured = thinned(t, np.degrees(np.unwrap(piece.phi_acc_rad)))
+    measured = plot.thinned(t, np.degrees(np.unwrap(piece.phi_acc_rad)))
     above = (
-        Curve(*measured, colour="silver", size=0.6),
-        Curve(every(t), every(np.degrees(target)), colour="ink"),
+        plot.Curve(*measured, colour="silver", size=0.6),
+        plot.Curve(plot.every(t), plot.every(np.degrees(target)), colour="ink"),
     )
-    below: list[Mark] = [Rule("y", 0.0)]
+    below: list[plot.Mark] = [plot.Rule("y", 0.0)]
     for one in result.candidates:
         if one.name == "riccati":
             continue
@@ -459,11 +444,11 @@ def _tuning_errors(result: Tuning, pieces: Sequence[Piece]) -> Figure:
         error = np.degrees(wrapped(phi - target))
         if np.isfinite(error).any():
             hue = _PAIRS[one.name][0] if one.name in _PAIRS else "purple"
-            below.append(Curve(*thinned(t, error), one.name, colour=hue, size=1.0))
+            below.append(plot.Curve(*plot.thinned(t, error), one.name, colour=hue, size=1.0))
     limits = (float(t[0]), float(t[-1]))
     panels = (
-        Plot("", "angle (degrees)", above, f"Grey: accelerometer; black: {by}", limits),
-        Plot("time (s)", "error (degrees)", below, x_limits=limits),
+        plot.Plot("", "angle (degrees)", above, f"Grey: accelerometer; black: {by}", limits),
+        plot.Plot("time (s)", "error (degrees)", below, x_limits=limits),
     )
-    title = f"Errors over time: {short(piece.source, 70)}"
-    return Figure(title, f"Errors are differences from {by}.", panels, 4.6)
+    title = f"Errors over time: {plot.short(piece.source, 70)}"
+    return plot.Figure(title, f"Errors are differences from {by}.", panels, 4.6)

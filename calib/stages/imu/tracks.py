@@ -16,15 +16,8 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import pip_install
 from calib.core.units import GRAVITY_MPS2
 from calib.solve.clock import Part
+from calib.stages.imu import mahony
 from calib.stages.imu.levelling import Levelling, level_three
-from calib.stages.imu.mahony import (
-    AngleFilter,
-    Mahony,
-    MahonyState,
-    accelerometer_angles,
-    filter_log,
-    mean_angle,
-)
 from calib.stages.imu.sampling import AXES, Readings
 
 # ----------------------------------------------------------------------
@@ -82,7 +75,7 @@ def three(part: Part, axes: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
 
 def angle_of(part: Part, axes: tuple[str, ...]) -> FloatArray:
     """Accelerometer's angle (n,) (2.1)."""
-    return accelerometer_angles(part.values[:, axes.index("ax")], part.values[:, axes.index("ay")])
+    return mahony.accelerometer_angles(part.values[:, axes.index("ax")], part.values[:, axes.index("ay")])
 
 
 # ----------------------------------------------------------------------
@@ -173,7 +166,7 @@ class Track:
 class Tuned:
     """The filter of the row "tuned", and whether its rate is that by the up vector instead of -gz."""
 
-    gains: AngleFilter
+    gains: mahony.AngleFilter
     up_vector: bool = False
 
 
@@ -182,7 +175,7 @@ def _start(phi_acc: FloatArray, rate_radps: FloatArray, period_s: float) -> floa
     size = max(round(_START_S / period_s), 1)
     rate = rate_radps[:size].copy()
     rate[0] = 0.0
-    return mean_angle(phi_acc[:size] - period_s * np.cumsum(rate))
+    return mahony.mean_angle(phi_acc[:size] - period_s * np.cumsum(rate))
 
 
 def on_grid(
@@ -237,10 +230,12 @@ def tracks_of(
         start = _start(phi_acc[id(part)], rate, period_s)
         return np.asarray(start + np.cumsum(rate * np.diff(part.t_s, prepend=part.t_s[0])))
 
-    def filtered(gains: AngleFilter, tilted: bool = False) -> Callable[[Part], FloatArray]:
+    def filtered(gains: mahony.AngleFilter, tilted: bool = False) -> Callable[[Part], FloatArray]:
         def angle(part: Part) -> FloatArray:
             rate, acc = rate_of(part, axes, tilted), phi_acc[id(part)]
-            return filter_log(gains, part.t_s, acc, rate, MahonyState(_start(acc, rate, period_s)))[0]
+            return mahony.filter_log(
+                gains, part.t_s, acc, rate, mahony.MahonyState(_start(acc, rate, period_s))
+            )[0]
 
         return angle
 
@@ -254,7 +249,7 @@ def tracks_of(
         skipped.append("on the chip: the log has no column onchip_phi_rad")
     add("gyroscope alone", gyroscope)
     add("accelerometer alone", lambda part: np.unwrap(phi_acc[id(part)]))
-    add("MM 3/3", filtered(Mahony()))
+    add("MM 3/3", filtered(mahony.Mahony()))
     add("levelling", filtered(Levelling()))
     lacking = ", ".join(log.lacks)
     if tuned is None:
@@ -269,7 +264,7 @@ def tracks_of(
             "not in the log"
         )
         return found, skipped
-    add("MM 3/3 with up vector", filtered(Mahony(), tilted=True))
+    add("MM 3/3 with up vector", filtered(mahony.Mahony(), tilted=True))
     add("levelling in three axes", levelled)
     samples = sum(len(part.values) for part in parts)
     for name in PEERS if peers else ():
