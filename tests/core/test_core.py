@@ -15,7 +15,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.core import writing
+from calib.core import compilation, writing
 from calib.core.bounded_yaml import YamlProblem, load
 from calib.core.errors import BadInputError, CalibError, ReaderGoneError, UsageError
 from calib.core.files import check_readable, file_sha256, read_bytes, read_text, read_yaml_mapping
@@ -298,6 +298,19 @@ def test_an_error_goes_between_processes() -> None:
 
 # ----------------------------------------------------------------------
 # What numba compiles.
+
+
+@pytest.mark.parametrize(
+    ("file", "made_from"),
+    [
+        ("estimator/driven.py", "actuator/kinematics.py"),
+        ("camera/verdict.py", "camera/checks.py"),
+    ],
+)
+def test_what_is_kept_is_compiled_anew_after_a_change_of_what_it_imports(file: str, made_from: str) -> None:
+    """By way of others, and whether a name or a whole module is imported."""
+    stages = Path(compilation.__file__).parents[1] / "stages"
+    assert stages / made_from in compilation._sources(stages / file)
 
 
 def test_of_two_processes_that_need_a_function_one_compiles_it(tmp_path: Path) -> None:
