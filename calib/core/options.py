@@ -80,7 +80,7 @@ class NoOptions:
 def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
     """Options of this class from a verb's or a caller's values, texts parsed.
 
-    Raises `UsageError` for a name that is none, with the nearest one.
+    Raises `UsageError` for a name that is none, with the nearest one, and for a number that no text could be.
     """
     known = {one.name: one for one in fields(kind)}
     hints = get_type_hints(kind)
@@ -97,8 +97,19 @@ def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
         if choices and value is not None and value not in choices:
             raise UsageError(f"{name} is {value!r}, expected one of {', '.join(map(str, choices))}")
         parse = known[name].metadata.get("parse") or (Path if Path in get_args(hints[name]) else None)
+        unit = _UNITS.get(name.rpartition("_")[2])
+        if parse and unit and isinstance(value, int | float):
+            try:
+                parse(f"{value!r}{unit}")
+            except UsageError as error:
+                _, _, why = str(error).partition("' ")
+                raise UsageError(f"{name}={value!r} {why}") from error
         parsed[name] = parse(value) if parse is not None and isinstance(value, str) else value
     return kind(**parsed)
+
+
+_UNITS = {"m": "m", "hz": "Hz", "kg": "kg"}
+"""Units of numbers by the ending of their names."""
 
 
 def name_of_flag(kind: type[Any], flag: str) -> str:

@@ -91,6 +91,12 @@ class Verdict:
         ranked = sorted(self.findings, key=lambda one: -_RANK[one.severity])
         return _unique(one.advice for one in ranked if one.advice)
 
+    def __str__(self) -> str:
+        """As the terminal shows it."""
+        from calib.core.words import as_text, of_verdict
+
+        return "\n".join(as_text(of_verdict(self)))
+
 
 def worst(words: Iterable[str]) -> Word:
     """The worst of several words, "ok" for none."""

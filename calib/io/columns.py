@@ -850,9 +850,9 @@ def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
     # That of an MPU6050 at its finest range.
     scaled = f"{{column: {_yaml(columns.sources[names[0]].column)}, unit: deg/s, factor: 0.00763}}"
     raise BadInputError(
-        f"{columns.source}: `{first}` is neither in rad/s nor in deg/s, in mdeg/s or in raw counts; "
-        f"{_advice('gyro', 'gyro', 'mdeg/s', columns)}, or for counts a line for each axis with the data "
-        f"sheet's scale, such as {names[0]}: {scaled}"
+        f"{columns.source}: `{first}` is neither in rad/s nor in deg/s. Of raw counts add to {columns.folder}"
+        f" a line for each axis with the data sheet's scale, such as {names[0]}: {scaled}; of mdeg/s "
+        f"{_advice('gyro', 'gyro', 'mdeg/s', columns)}"
     )
 
 

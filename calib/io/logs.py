@@ -662,9 +662,11 @@ def refuse_counts(log: Log, names: Sequence[str]) -> None:
     for name in names:
         if name in log.columns and log.map is not None and log.unit(name) == "counts":
             column = log.map.sources[name].column
+            # An MPU6050's at its finest ranges.
+            scale = "unit: g, factor: 6.1e-05" if kind_of(name) == "accel" else "unit: deg/s, factor: 0.00763"
             raise BadInputError(
-                f"{log.source}: {name} is in counts, expected a unit; calib imu intrinsics finds the scale: "
-                f"add it to {log.map.folder}, such as {name}: {{column: {column}, factor: 0.0024}}"
+                f"{log.source}: {name} is in counts, expected a unit; the data sheet or calib imu intrinsics "
+                f"has the scale: add it to {log.map.folder}, such as {name}: {{column: {column}, {scale}}}"
             )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.core.command import one_command
-from calib.core.errors import BadInputError
+from calib.core.errors import BadInputError, UsageError
 from calib.core.options import options_of
 from calib.core.stage import AnyStage, Files
 
@@ -64,6 +64,8 @@ def expanded(sources: Any) -> tuple[Path, ...]:
         if not matches:
             raise BadInputError(f"{text}: matches no file")
         return tuple(Path(one) for one in matches)
+    if not isinstance(sources, Sequence):
+        raise UsageError(f"found {type(sources).__name__}, expected a path, a pattern, or several of them")
     return tuple(path for one in sources for path in expanded(one))
 
 
@@ -81,8 +83,11 @@ def function(name: str) -> Callable[..., Any]:
         from calib.core.rig import Rig
 
         output = options.pop("output", None) if streams else None
+        paths = expanded(sources)
+        if made.sources and not made.optional and not paths:
+            raise UsageError(f"{name}: found no paths; it takes: {made.sources}")
         files = Files(
-            expanded(sources),
+            paths,
             output=None if output is None else Path(output),
             narrate=logging.getLogger("calib").info,
         )

@@ -139,7 +139,9 @@ _PRBS = 3
 def _pwm(rig: SimulatedRig, volt: float) -> float:
     # 6 V is a PWM value of 127.5 in the source, so it is not rounded here.
     supply = float(getattr(rig.pump.static, "supply_V", 12.0))
-    return min(max(255.0 * volt / supply, 0.0), 255.0)
+    if not 0.0 <= volt <= supply:
+        raise BadInputError(f"found {volt:g} V for a motor, expected 0 to {supply:g}, its supply")
+    return 255.0 * volt / supply
 
 
 class Static(Scenario):

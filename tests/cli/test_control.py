@@ -163,6 +163,7 @@ def test_rigs_that_cannot_be_controlled(
     ("words", "sentence"),
     [
         (("run", "step", "--controller", "lqr"), "--controller: 'lqr' is not one of p, pid"),
+        (("run", "elongation", "--controller", "pid"), "pid does not suit a reference of lengths, expected"),
         (("run", "step", "--pwm-limits", "0,nan"), "--pwm-limits: '0,nan' is not two finite numbers"),
         (("tune", "--phase-margin", "95deg"), "phase margin: found 95 deg"),
     ],

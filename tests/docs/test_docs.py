@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shlex
@@ -11,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,22 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     }
     again = names["calib"].Log.load("simulated.csv")
     assert len(again) == len(names["log"]) and "true_phi_rad" in again.columns
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: calib.intrinsics("images", square_m=25), "square_m=25 is not between 0.01 mm and 10 m"),
+        (lambda: calib.intrinsics("images", square_m=-0.02), "square_m=-0.02 is not positive"),
+        (lambda: calib.intrinsics("images", square_m=math.nan), "square_m=nan is not a number with a unit"),
+        (lambda: calib.intrinsics([]), "intrinsics: found no paths; it takes: A folder of pictures"),
+        (lambda: calib.intrinsics(np.zeros((48, 64))), "found ndarray, expected a path"),
+        (lambda: calib.plots(None), "plots: found NoneType, expected a result"),
+    ],
+)
+def test_what_a_function_cannot_take_is_one_sentence(call: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(sentence)):
+        call()
 
 
 def test_the_readme_shows_what_its_first_command_prints() -> None:

@@ -818,6 +818,14 @@ def test_two_logs_are_joined_by_the_motion_that_both_saw(
         np.testing.assert_array_equal(log.columns[name][there], one.columns[name][first:])
 
 
+def test_what_does_not_bend_is_joined_by_the_markers_way() -> None:
+    """A marker on a rigid arm turns by another angle than constant curvature makes of its place."""
+    camera, board = _apart(twin_log(RIG, "prbs", {}, 3), 1234.567)
+    rates = {**board.columns, "gz_radps": 0.52 * board.columns["gz_radps"]}
+    _, found, _ = joined(camera, replace(board, columns=rates), _rig_file(), "rig.yaml")
+    assert found is not None and found.offset_s == pytest.approx(1234.567 - RIG.tracker.latency_s, abs=5e-3)
+
+
 @pytest.mark.parametrize("with_plane", [True, False])
 def test_a_board_that_begins_within_the_swing_is_not_joined_a_period_off(with_plane: bool) -> None:
     camera, board = _apart(twin_log(RIG, "swing", {}, 3), 1234.567)

@@ -55,6 +55,7 @@ from calib.stages.imu.tuning import (
     riccati,
     rms,
     smooth_log,
+    solve_tune,
     tune,
 )
 
@@ -768,6 +769,12 @@ def test_the_noise_of_a_reference_contradicts_nothing() -> None:
     noise = 0.4 * np.nanstd(piece.reference_rad) * np.random.default_rng(0).normal(size=len(piece.t_s))
     noisy = [replace(piece, reference_rad=piece.reference_rad + noise)]
     assert contradictions(noisy, tune(noisy, DATA_SHEET)) == []
+
+
+def test_logs_at_rest_tell_no_filter_from_another() -> None:
+    log = simulate("static", seed=0, duration="30s")
+    found = solve_tune([tune_log(log, Reading(False, "none"))], DATA_SHEET, "rest")
+    assert found.verdict.word == "poor" and "tell no filter from another" in found.verdict.reasons[0]
 
 
 def test_a_sensor_that_was_mounted_otherwise_in_one_log_is_named() -> None:

@@ -274,6 +274,7 @@ def test_words_that_are_not_known(name: str, options: dict[str, str], words: str
     [
         ("swing", {"length_m": "-0.065"}, "expected positive lengths"),
         ("elongation", {"start_m": "-0.01"}, "expected positive lengths"),
+        ("steps", {"volts": "99"}, "found 99 V for a motor, expected 0 to 12, its supply"),
     ],
 )
 def test_numbers_that_no_experiment_can_have(name: str, options: dict[str, str], words: str) -> None:

@@ -2104,7 +2104,7 @@ def judge(
     if next_ones:
         best = next_ones[0]
         advice = (
-            f"next experiment: {best.name} ({best.what}); it would leave {label_of(best.worst)} as the least "
+            f"the experiment {best.name} ({best.what}) would leave {label_of(best.worst)} as the least "
             f"known, to {100.0 * best.worst_relative:.2g} %"
         )
         out.append(Finding("remark", "", advice))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from calib.core.arrays import FloatArray
@@ -21,17 +23,20 @@ _MIRRORED = 0.25
 off, is mirrored as well, and its next best leaves 0.13."""
 
 
-def _way(camera: Log, rig: Rig, rig_name: str) -> tuple[FloatArray, FloatArray, bool]:
-    """Times, angle or way along the marker's main direction, and whether it is an angle."""
+def _ways(camera: Log, rig: Rig, rig_name: str) -> Iterator[tuple[FloatArray, FloatArray, bool]]:
+    """Times, what the marker shows of a turn, and whether that is an angle.
+
+    By camera and plane, where the rig has them, the angle of a head that bends; then, for what turns
+    otherwise, the way along the marker's main direction.
+    """
     pictures = camera.signals("u_px", "v_px")
     plane = rig.current_plane(rig_name)
-    if plane is None or rig.camera is None:
-        moved = pictures.values - pictures.values.mean(axis=0)
-        return pictures.t_s, moved @ np.linalg.svd(moved, full_matrices=False)[2][0], False
-    marker = plane.to_world(pictures.values, rig.camera)
-    phi = angle_from_marker(marker, rig.marker_offset_m)
-    fine = np.isfinite(phi)
-    return pictures.t_s[fine], phi[fine], True
+    if plane is not None and rig.camera is not None:
+        phi = angle_from_marker(plane.to_world(pictures.values, rig.camera), rig.marker_offset_m)
+        fine = np.isfinite(phi)
+        yield pictures.t_s[fine], phi[fine], True
+    moved = pictures.values - pictures.values.mean(axis=0)
+    yield pictures.t_s, moved @ np.linalg.svd(moved, full_matrices=False)[2][0], False
 
 
 def joined(
@@ -61,9 +66,10 @@ def joined(
                 raise BadInputError(f"{log.source}: has no {what}, expected {' and '.join(names)}")
         own = list(_MARKER)
         gyro = board.signals("gz_radps")
-        camera_s, way, scaled = _way(camera, rig, rig_name)
-        found = clocks(camera_s, way, gyro.t_s, gyro["gz_radps"], scaled)
-        if found is None:
+        for camera_s, way, scaled in _ways(camera, rig, rig_name):
+            found = clocks(camera_s, way, gyro.t_s, gyro["gz_radps"], scaled)
+            if found is not None:
+                break
             other = clocks(camera_s, -way, gyro.t_s, gyro["gz_radps"], scaled) if scaled else None
             if other is not None and other.next_left > _MIRRORED:
                 raise BadInputError(
@@ -72,6 +78,7 @@ def joined(
                     "and marker; an IMU has its x axis from the head to the base; a camera upside down may "
                     "have read the plane's board from its other end: state first_corner_px in its board.yaml"
                 )
+        if found is None:
             raise BadInputError(
                 f"{camera.source}: its motion and that of {board.source} do not tell one offset of their "
                 "clocks, expected quick turns of different sizes at uneven times, or with camera and plane "

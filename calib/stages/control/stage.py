@@ -125,12 +125,16 @@ class Runs:
 def _read_run(
     files: Files, rig: Rig, options: RunOptions
 ) -> tuple[SimulatedRig, Model, Reference, Sequence[str], Controller | None, RunOptions, Progress]:
-    from calib.stages.control.trial import CONTROLLERS, controllers_for
+    from calib.stages.control.trial import CONTROLLERS, controllers_for, suited
 
     for name in options.controllers or ():
         if name not in CONTROLLERS:
             raise UsageError(f"--controller: {name!r} is not one of {', '.join(CONTROLLERS)}")
     machine, model, wanted = _wanted(files, rig, options.duration_s, options.pwm_limits, options.plant)
+    for name in options.controllers or ():
+        if name not in suited(wanted):
+            which = f"{wanted.kind}, expected one of {', '.join(suited(wanted))}"
+            raise UsageError(f"--controller: {name} does not suit a reference of {which}")
     names = options.controllers or controllers_for(wanted, rig.controller)
     files.narrate("simulated: a model of a rig, not the rig")
     files.hashes |= rig.identities("actuator", "pump", "controller")

@@ -107,10 +107,14 @@ def control_model(rig: SimulatedRig, section: Controller | None = None, limits: 
     return Model(rig.plant, rig.pump, rig.strength, low, high)
 
 
+def suited(reference: Reference) -> tuple[str, ...]:
+    """Controllers of the kind of a reference: of the angle, or of both lengths."""
+    return _ANGLE if reference.kind == "angle" else _LENGTHS
+
+
 def controllers_for(reference: Reference, section: Controller | None) -> tuple[str, ...]:
-    """Controllers that suit the kind of a reference, tuned ones only where they have been tuned."""
-    names = _ANGLE if reference.kind == "angle" else _LENGTHS
-    return tuple(name for name in names if section is not None or not name.startswith("tuned"))
+    """Controllers that suit a reference, tuned ones only where they have been tuned."""
+    return tuple(one for one in suited(reference) if section is not None or not one.startswith("tuned"))
 
 
 def _with_limits(model: Model, pid: Pid) -> Pid:

@@ -265,7 +265,9 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
         text = f"the camera gives {seen_hz:.3g} pictures a second and the board ticks at {whole.tick_hz:g} Hz"
         text += ": the guard takes a tick without a picture for a lost marker, and stops the pumps"
         findings.append(
-            Finding("poor", text, "let the board tick at the camera's rate, calib lowpass --rate")
+            Finding(
+                "poor", text, f"let the board tick at the camera's rate: calib lowpass --rate {seen_hz:.0f}Hz"
+            )
         )
     if whole.align is not None and whole.align.time_offset_s < 0.0:
         early_ms = -1e3 * whole.align.time_offset_s

@@ -1209,6 +1209,14 @@ def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterato
     """What is to be known of the gains, and of the logs that they are from."""
     pieces = [piece for log in logs for piece in log.pieces]
     yield from contradictions(pieces, result)
+    turns = (_level(piece.t_s, integral(piece.t_s, piece.rate_radps)) for piece in pieces)
+    most = max((float(np.nanstd(turn)) for turn in turns if np.isfinite(turn).any()), default=math.inf)
+    if most < _TURNS_RAD:
+        yield Finding(
+            "poor",
+            f"The logs turn by {math.degrees(most):.2g} deg (RMS) only: they tell no filter from another.",
+            "log the rig in motion, with the IMU at its full rate",
+        )
     gains, base = result.recommended.gains, result.candidates[0]
     if isinstance(gains, Mahony) and gains.Kp < 2.0 * _RINGS * math.sqrt(gains.Ki):
         yield Finding(
