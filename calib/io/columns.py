@@ -294,7 +294,8 @@ class Passed:
             (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
             (self.twice, f"{self.twice} rows are written twice; left out"),
             (self.said, f"{self.said} lines between the rows hold words and no number; passed over"),
-            (self.damaged, f"{self.damaged} lines came damaged and are left out, the first {self.damage}"),
+            (self.damaged == 1, f"a line came damaged and is left out, {self.damage}"),
+            (self.damaged > 1, f"{self.damaged} lines came damaged and are left out, the first {self.damage}"),
         )
         return [sentence for there, sentence in kinds if there]
 

@@ -440,7 +440,8 @@ def _broken(rig: Rig) -> None:
     """Inputs that are refused, each with its sentence."""
     head, *rows = (rig.folder / "logs" / "moved.csv").read_text(encoding="utf-8").splitlines()
     rig.write(
-        "bad/word.csv", "\n".join([head, *rows[:40], rows[40].replace(",", ",x", 1), *rows[41:]]) + "\n"
+        "bad/word.csv",
+        "\n".join([head, *rows[:40], *(row.replace(",", ",x", 1) for row in rows[40:])]) + "\n",
     )
     rig.write("bad/back.csv", "\n".join([head, *rows[:40], *rows[10:]]) + "\n")
     rig.write("bad/nothing.csv", "")

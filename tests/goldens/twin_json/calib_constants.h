@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x3229ADC5UL
+#define CALIB_ID 0x9BE1A42EUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -322,7 +322,7 @@ static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
 #define CALIB_ENVELOPE_GREATEST_M 0.115154251f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
-#define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
+#define CALIB_ENVELOPE_FULL_TICKS 185 /* ticks that a pump may stay at its greatest command */
 #define CALIB_ENVELOPE_OPEN_TICKS 3600 /* ticks that a pump may be on in open loop */
 #define CALIB_ENVELOPE_OPEN_HIGH_PWM 255.0f /* greatest command in open loop: what holds the longest length by the pump's map, PWM */
 #define CALIB_ENVELOPE_OPEN_HIGH 255 /* the same as a whole number */
