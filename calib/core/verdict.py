@@ -93,9 +93,13 @@ class Verdict:
 
     def __str__(self) -> str:
         """As the terminal shows it."""
-        from calib.core.words import as_text, of_verdict
+        lists = {"reason": self.reasons, "remark": self.remarks, "advice": self.advice}
+        said = [LEADS[kind] + text for kind, texts in lists.items() for text in texts]
+        return "\n".join([f"verdict: {self.word}", *said])
 
-        return "\n".join(as_text(of_verdict(self)))
+
+LEADS = {"reason": "  - ", "remark": "  (remark) ", "advice": "  next: "}
+"""What stands before a sentence of each kind in a terminal."""
 
 
 def worst(words: Iterable[str]) -> Word:

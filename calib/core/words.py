@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from calib.core.units import UNITS, unit_of
-from calib.core.verdict import Verdict
+from calib.core.verdict import LEADS, Verdict
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -333,8 +333,7 @@ def as_text(blocks: Sequence[Block], widest: int = _WIDEST) -> list[str]:
     out: list[str] = []
     for block in blocks:
         if isinstance(block, Line):
-            lead = {"reason": "  - ", "remark": "  (remark) ", "advice": "  next: "}.get(block.kind, "")
-            out.append(f"{lead}{block.text}")
+            out.append(LEADS.get(block.kind, "") + block.text)
             continue
         if block.title and block.head[0] != block.title:
             out.append(f"{block.title}:")

@@ -295,7 +295,10 @@ class Passed:
             (self.twice, f"{self.twice} rows are written twice; left out"),
             (self.said, f"{self.said} lines between the rows hold words and no number; passed over"),
             (self.damaged == 1, f"a line came damaged and is left out, {self.damage}"),
-            (self.damaged > 1, f"{self.damaged} lines came damaged and are left out, the first {self.damage}"),
+            (
+                self.damaged > 1,
+                f"{self.damaged} lines came damaged and are left out, the first {self.damage}",
+            ),
         )
         return [sentence for there, sentence in kinds if there]
 
