@@ -955,10 +955,14 @@ def _implausible(
     biased = at_rest and float(spread.max()) < _QUIET_RADPS
     if felt and found.flat and not biased and scale * found.by_gyro_rad > least_rad:
         times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
-        return f"turns {times:.3g} times as far as the accelerometer's angle"
+        # A pendulum's force hardly turns, in whatever unit: the sensor at its end feels the rod's alone.
+        as_other = [times * UNITS["gyro"][unit] / scale for unit in ("rad/s", "deg/s")]
+        if min(as_other) <= _FARTHER:
+            return f"turns {times:.3g} times as far as the accelerometer's angle"
     if at_rest:
         bias = scale * float(np.abs(np.median(calm, axis=(0, 1))).max())
-        if bias > _LARGEST_BIAS_RADPS:
+        # What goes to and fro by more is a swing of which the accelerometer feels nothing.
+        if bias > max(_LARGEST_BIAS_RADPS, scale * float(values.std(axis=0).max())):
             return f"has a bias of {bias:.3g} rad/s at rest"
         # A slow swing, which an accelerometer hardly feels, is no noise: that lives in differences as well.
         rough = scale * np.median(np.diff(calm, 4, axis=1).std(axis=1), axis=0) / math.sqrt(70.0)

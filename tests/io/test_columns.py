@@ -393,3 +393,17 @@ def test_stamps_that_never_advance_tell_no_unit_of_rates(tmp_path: Path) -> None
     words = "the time `timestamp` is 1730000000 in every row, expected it to advance"
     with pytest.raises(BadInputError, match=words):
         read_log(path)
+
+
+@pytest.mark.parametrize("felt", [0.0, 0.02, 0.05])
+def test_a_pendulum_may_feel_no_turn_of_gravity(tmp_path: Path, felt: float) -> None:
+    """An IMU at its end feels the rod's force alone, and turns by any number of times as far."""
+    t, rng = 0.01 * np.arange(1200), np.random.default_rng(0)
+    swing = 0.6 * np.cos(6.0 * t) * np.exp(-0.05 * t)
+    rate = np.degrees(np.gradient(swing, t)) + 0.1 * rng.normal(size=len(t))
+    force = np.stack([np.cos(swing), felt * swing], axis=1) + 0.003 * rng.normal(size=(len(t), 2))
+    path, rows = tmp_path / "swing.csv", np.column_stack([t, force, rate])
+    np.savetxt(path, rows, fmt="%.5f", delimiter=",", header="t_s,acc_x,acc_y,gyro_z", comments="")
+    for said in (LogOptions(), LogOptions(gyro_unit="deg/s", acc_unit="g")):
+        log = read_log(path, said)
+        np.testing.assert_allclose(np.degrees(log.columns["gz_radps"]), rate, atol=1e-4)
