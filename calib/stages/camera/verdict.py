@@ -56,7 +56,8 @@ class Limits:
     repeated_remark : error that repeats at the same points over what independent errors leave.
     change_times, change_poor_px, change_remark_px : RMS over what it would be if each view had a camera of
         its own, and the part of it that this would take away, px at up to 1000 pixels' width. Public sets
-        reach 1.2 times, a board that moves before a rolling shutter 2 to 3.
+        reach 1.2 times, a board that moves before a rolling shutter 2 to 3, a lens that focuses anew 6.
+    change_most_times, change_most_px : the part that is poor where it is so many times the rest.
     decrement : standard deviations that the solver may stop short of a minimum.
     split_ratio, change_ratio : two cameras, in any order and one after the other: the statistic over
         what chance reaches. One camera reaches 1.2 in a hundred sets, two that differ by three
@@ -105,6 +106,7 @@ class Limits:
     change_times = 1.5
     change_poor_px = 0.1
     change_remark_px = 0.03
+    change_most_times, change_most_px = 4.0, 0.05
     decrement = 2.0
     split_ratio = 1.5
     change_ratio = 1.3
@@ -575,7 +577,9 @@ def _of_change(fit: bundle.Calibration) -> Iterator[Finding]:
     together = float(np.hypot(alone, change))
     if together < Limits.change_times * alone or change < Limits.change_remark_px * scale:
         return
-    most = Limits.change_poor_px * scale
+    most = scale * (
+        Limits.change_most_px if together > Limits.change_most_times * alone else Limits.change_poor_px
+    )
     text = (
         f"The camera or the board changes from picture to picture: each would fit to {alone:.2g} px with a "
         f"camera of its own, all together fit to {together:.2g} px (up to {most:.2g} px of change is good). "
