@@ -368,9 +368,14 @@ def of_leaving(
             f"{several([one.name for one in some], 20)}"
         )
         many = share > Limits.leaving_bad and not (some is views and moved_px < Limits.leaving_px)
+        advice = ""
         if many:
             text += f"; that is more than {100 * Limits.leaving_bad:.0f} % of them"
-        yield Finding(severity if many else "remark", f"{text}.")
+            advice = (
+                "Give the pictures as one camera took them, with one zoom and focus, and none turned, "
+                "cropped or resized by a program or a phone."
+            )
+        yield Finding(severity if many else "remark", f"{text}.", advice)
 
 
 def of_copies(copies: Sequence[LeftOut]) -> Iterator[Finding]:
