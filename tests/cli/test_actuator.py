@@ -220,6 +220,10 @@ def test_springs_from_weights(calib: Run, tmp_path: Path) -> None:
     assert (tmp_path / "f" / "identify_stiffness.png").exists()
     path.write_text("mass_g\n1\n")
     assert calib("identify", "stiffness", path, "--rig", rig).code == 3
+    path.write_text("elongation_m,force_N\n0.005,1\n10,2\n")
+    ended = calib("identify", "stiffness", path, "--rig", rig)
+    assert ended.code == 3
+    assert "line 3: elongation_m is 10, expected at most 1; of another unit?" in ended.sentence
 
 
 @pytest.fixture(scope="module")

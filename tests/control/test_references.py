@@ -183,7 +183,8 @@ def test_a_recorded_log_is_a_reference(make: Make) -> None:
         ("t_s,q1_m,q2_m\n0,0.07,\n", "line 2: q2_m is blank or nan"),
         ("t_s,q1_m,q2_m\n0,0.07,0.07\n1,0.07,0.07\n0.5,0.07,0.07\n", "line 4: t_s is 0.5 after 1"),
         ("t_s,q1_m,q2_m\n0,0.07,0.07\n5,0.07,0.07\n", "has 2 rows over 5 s"),
-        ("t_s,phi_rad\n0,0.1\n1,30\n2,0.1\n", "ref.csv: angle: found .* rad, at which no length is at rest"),
+        ("t_s,phi_rad\n0,0.1\n1,30\n2,0.1\n", r"line 3: phi_rad is 30, .* 3\.14; is it in degrees\?"),
+        ("t_s,q1_m,q2_m\n0,65,65\n", r"line 2: q1_m is 65, expected at most 1; is it in millimetres\?"),
     ],
 )
 def test_files_that_are_no_references(make: Make, text: str, sentence: str) -> None:

@@ -511,6 +511,8 @@ def read_track(
     return Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving, how, delay_s, begin)
 
 
+_MOST_M = 1.0
+"""Elongation beyond which a table is in another unit."""
 _LENGTHS = {"elongation_mm": 1e-3, "displacement_mm": 1e-3, "elongation_m": 1.0, "displacement_m": 1.0}
 _LOADS = {"force_n": 1.0, "force_mn": 1e-3, "mass_kg": GRAVITY_MPS2, "mass_g": 1e-3 * GRAVITY_MPS2}
 
@@ -528,4 +530,9 @@ def read_displacements(path: Path) -> tuple[FloatArray, FloatArray]:
         line = cells.lines[int(bad[0])]
         raise BadInputError(f"{shown(path)}, line {line}: has a blank or nan, expected numbers")
     scales = (_LENGTHS[cells.header[x].lower()], _LOADS[cells.header[y].lower()])
+    for row in np.nonzero(np.abs(table[:, 0]) * scales[0] > _MOST_M)[0].tolist():
+        where, most = f"{shown(path)}, line {cells.lines[row]}", _MOST_M / scales[0]
+        raise BadInputError(
+            f"{where}: {cells.header[x]} is {table[row, 0]:g}, expected at most {most:g}; of another unit?"
+        )
     return table[:, 0] * scales[0], table[:, 1] * scales[1]

@@ -54,6 +54,12 @@ def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
         raise BadInputError(
             f"{source}, line {cells.lines[row]}: {header[at[k]]} is blank or nan, expected a number"
         )
+    for row, k in np.argwhere(np.abs(table) > [math.inf, *(_most(name) for name in names)]).tolist():
+        unit = "degrees" if names[k - 1].endswith("_rad") else "millimetres"
+        raise BadInputError(
+            f"{source}, line {cells.lines[row]}: {names[k - 1]} is {table[row, k]:g}, expected at most "
+            f"{_most(names[k - 1]):.3g}; is it in {unit}?"
+        )
     t = table[:, 0]
     for row in (np.nonzero(np.diff(t) < 0.0)[0] + 1).tolist():
         raise BadInputError(
@@ -63,6 +69,11 @@ def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     # Loggers stamp samples that waited in a buffer alike; the last one is the newest.
     newest = np.append(np.diff(t) > 0.0, True)
     return names, t[newest], table[newest, 1:]
+
+
+def _most(name: str) -> float:
+    """What an angle [rad] or a length [m] of a reference may be."""
+    return math.pi if name.endswith("_rad") else 1.0
 
 
 def read_reference(path: Path, model: Model) -> references.Reference:

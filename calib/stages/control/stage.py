@@ -428,7 +428,7 @@ def _read_tune(
     )
     for what, value, low, high, unit in asked:
         if not low < value < high:
-            raise UsageError(f"{what}: found {value:g}{unit}, expected {low:g} to {high:g}{unit}")
+            raise UsageError(f"{what}: found {value:g}{unit}, expected between {low:g} and {high:g}{unit}")
     criterion = ControllerCriterion(gain_margin=gain, phase_margin_rad=phase_rad, sensitivity=peak)
     machine, model = controlled(rig, options.pwm_limits)
     # Of lowpass and align the delays alone count: an alignment with a poor mount angle spoils no gains.
