@@ -11,11 +11,15 @@ from calib.cli.common import JsonOption, document, narrate, progress_bar, say, s
 from calib.cli.verbs import of_logs
 from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
+from calib.core.verdict import LEADS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from calib.runner.graph import Job
+
+_SHOWN = 3
+"""Sentences on what to record next, for a terminal."""
 
 
 @of_logs
@@ -66,7 +70,10 @@ def run(
         _tell(done.ended, done.files, output)
         say(f"can it be flashed? {decision.answer}: {decision.headline}")
         for sentence in decision.weak:
-            say(f"  - {sentence}")
+            say(f"{LEADS['reason']}{sentence}")
+        more = len(decision.record) - _SHOWN
+        for sentence in [*decision.record[:_SHOWN], *([f"{more} more on the page"] if more > 0 else [])]:
+            say(f"{LEADS['advice']}{sentence}")
     narrate(f"page written to {output / 'report.html'}")
     if decision.exit_code:
         raise typer.Exit(decision.exit_code)

@@ -174,7 +174,9 @@ class Rig:
         if not file.exists():
             if missing_ok:
                 return Rig()
-            raise BadInputError(f"{shown(file)}: cannot be read: there is no such file")
+            rigs = sorted(shown(one.name) for one in file.parent.glob("*.y*ml") if SECTIONS.ours(one))
+            hint = nearest(file.name, rigs)
+            raise BadInputError(f"{shown(file)}: cannot be read: there is no such file{hint}")
         return Rig.of(read_yaml_mapping(file), file)
 
     @staticmethod

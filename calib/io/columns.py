@@ -74,6 +74,17 @@ POSE = (*POSITION, *QUATERNION, "tip_phi_rad")
 
 COLUMNS = (*MEASURED, *COMMANDED, *PRESSURES, *POSE, *TRUE)
 
+STATES = (
+    "t_s", "q1_m", "q2_m", "dq1_mps", "dq2_mps", "phi_rad", "length_m", "x_m", "y_m", "gyro_bias_radps",
+    "sigma_q1_m", "sigma_q2_m", "sigma_phi_rad", "nis_camera", "nis_accel", "nis_gyro",
+    "gated_camera", "gated_accel", "gated_gyro", "flags", "rest_weight", "swing_weight",
+    "driven_weight",
+)  # fmt: skip
+"""Columns of the states that `calib replay` writes."""
+
+BASELINE = ("t_s", "q1_m", "q2_m", "phi_rad", "length_m", "x_m", "y_m")
+"""Columns of what the published pipeline estimates."""
+
 ACCEL = ("ax_mps2", "ay_mps2", "az_mps2")
 GYRO = ("gx_radps", "gy_radps", "gz_radps")
 
@@ -170,6 +181,11 @@ _KIND = {
     **dict.fromkeys((*COMMANDED, *PRESSURES), "pressure"),
     **dict.fromkeys(POSITION, "length"),
 }
+
+
+def are_states(names: tuple[str, ...]) -> bool:
+    """Whether these are the columns of a table of states."""
+    return names[:6] == STATES[:6] or names == BASELINE
 
 
 def is_arm_log(names: Sequence[str]) -> bool:
@@ -514,10 +530,12 @@ def column_map(
 ) -> ColumnMap:
     """Which of the columns `names` of a file is what, by their names and by what a person states.
 
-    Raises `BadInputError` for no time, for a column that two names mean, and for a name that comes twice.
+    Raises `BadInputError` for states, no time, a column that two names mean, and a name that comes twice.
     """
     where = f"{source}, line {line}"
     names = tuple(name.strip() for name in names)
+    if are_states(names):
+        raise BadInputError(f"{source}: holds states that calib replay has written, expected a log")
     add = shown(file.path if file else log.with_name("columns.yaml"))
     stated = dict(file.sources) if file else {}
     found: dict[str, list[tuple[str, str]]] = {}

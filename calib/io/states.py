@@ -16,6 +16,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, package, pip_install
 from calib.core.files import shown
 from calib.core.writing import Kind, column_names, head, replacing
+from calib.io.columns import STATES, are_states
 from calib.io.tables import GENERAL, TIME, WHOLE, table_bytes
 
 # ----------------------------------------------------------------------
@@ -106,17 +107,6 @@ def _mcap(path: Path, stream: IO[bytes], names: tuple[str, ...]) -> Iterator[Add
 # ----------------------------------------------------------------------
 # The states file that `calib replay` writes, block by block: CSV, Parquet or MCAP by its ending.
 
-STATES = (
-    "t_s", "q1_m", "q2_m", "dq1_mps", "dq2_mps", "phi_rad", "length_m", "x_m", "y_m", "gyro_bias_radps",
-    "sigma_q1_m", "sigma_q2_m", "sigma_phi_rad", "nis_camera", "nis_accel", "nis_gyro",
-    "gated_camera", "gated_accel", "gated_gyro", "flags", "rest_weight", "swing_weight",
-    "driven_weight",
-)  # fmt: skip
-"""Columns of the states file."""
-
-BASELINE = ("t_s", "q1_m", "q2_m", "phi_rad", "length_m", "x_m", "y_m")
-"""Columns of what the published pipeline estimates."""
-
 ENDINGS = (".csv", ".parquet", ".mcap")
 """Of the formats; any other ending is written as CSV."""
 
@@ -126,11 +116,9 @@ def _holds_states(path: Path) -> bool:
     if start.startswith(b"\x89MCAP0"):
         # The header names the library.
         return b"calib" in start
-    names = column_names(path)
-    return names[: len(_FIRST)] == _FIRST or names == BASELINE
+    return are_states(column_names(path))
 
 
-_FIRST = STATES[:6]
 STATES_FILE = Kind("states", ENDINGS, _holds_states)
 
 _GROUP_ROWS = 1 << 17

@@ -24,6 +24,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import one_line, read_bytes, read_text, shown
 from calib.core.options import LogOptions
 from calib.core.units import plain_number
+from calib.core.words import several
 from calib.io.columns import (
     Block,
     ColumnMap,
@@ -576,7 +577,7 @@ class Cells:
 
     def column(self, wanted: str | None, known: Sequence[str], what: str) -> int:
         """Index of a column, the one asked for or the first known name. Raises `BadInputError`."""
-        low, names = [name.lower() for name in self.header], ", ".join(self.header)[:120]
+        low, names = [name.lower() for name in self.header], several(self.header, 8)
         if wanted is not None and wanted.lower() not in low:
             raise BadInputError(f"{shown(self.path)}: has no column {wanted}, found {names}")
         name = next((name for name in (known if wanted is None else (wanted.lower(),)) if name in low), None)

@@ -85,6 +85,7 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     """
     from calib.io.columns import is_arm_log
     from calib.io.logs import columns_of
+    from calib.io.states import STATES_FILE
 
     if not root.is_dir():
         what = "is a file" if root.exists() else "is not there"
@@ -110,13 +111,20 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     pictures, board = _pictures(root if flat else root / "images", taken)
     plane, plane_board = _pictures(root / "images" / "plane", taken)
     logs: list[LogFile] = []
+    states: list[Path] = []
     for path in _listed(root / "logs", _LOGS):
-        if all(taken(part) for part in with_beside([path])):
+        if not all(taken(part) for part in with_beside([path])):
+            continue
+        if STATES_FILE.ours(path):
+            states.append(path)
+        else:
             name = slug(path.stem, (log.slug for log in logs))
             logs.append(LogFile(path, name, columns_of(path, options), _kind(path.name)))
     own = root / "rig.yaml"
     rig = own if own.is_file() and taken(own) else None
     left_out += _passed_over(root, flat)
+    if states:
+        left_out.append(f"logs/: states that calib replay has written, left out: {_names(states)}")
     if arms := [log.path for log in logs if is_arm_log(log.columns or ())]:
         left_out.append(f"logs/: of a bending arm, which calib identify arm takes: {_names(arms)}")
     if not (pictures or plane or logs):

@@ -57,8 +57,9 @@ def _carried_out(
             check_writable(files.output, getattr(importlib.import_module(module), kind) if kind else None)
     if figures is not None:
         check_figures(figures)
-    # A name that a person has mistyped is no empty rig for a stage that only reads it.
-    may_begin = made.writes_rig(options) or (rig_path.name == RIG and rig_path.parent.is_dir())
+    # A name that a person has mistyped is no empty rig for a stage that lives on its sections.
+    of_data = made.writes_rig(options) and bool(made.sources) and not made.needs
+    may_begin = of_data or (rig_path.name == RIG and rig_path.parent.is_dir())
     rig = Rig.load(rig_path, missing_ok=may_begin)
     outcome = made.run(files, rig, options)
     sections = made.sections(outcome)

@@ -29,9 +29,9 @@ import yaml
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
-from calib.io.columns import COLUMNS, TRUE
+from calib.io.columns import COLUMNS, STATES, TRUE
 from calib.io.logs import Log, iter_log
-from calib.io.states import STATES, states_writer
+from calib.io.states import states_writer
 from calib.io.tables import GENERAL, TIME, table_bytes
 from calib.stages.estimator.consistency import Tally
 from calib.stages.estimator.kinematic import OUT

@@ -20,8 +20,8 @@ import calib
 from calib.core.arrays import FloatArray
 from calib.core.errors import CalibError
 from calib.core.rig import Geometry, Rig
+from calib.io.columns import STATES
 from calib.io.logs import Log, write_log
-from calib.io.states import STATES
 from calib.stages.estimator.replay import replay_log
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario

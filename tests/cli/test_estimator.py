@@ -15,8 +15,8 @@ from estimatorlogs import simulated
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
+from calib.io.columns import STATES
 from calib.io.logs import Log, write_log
-from calib.io.states import STATES
 from calib.stages.firmware.header import header_of
 from calib.twin.rig import SimulatedRig
 

@@ -104,12 +104,21 @@ def test_a_rig_without_a_plane(calib, rig) -> None:
     assert "CALIB_PLANE_INVERSE" not in text
 
 
-@pytest.mark.parametrize("name", ["rigg.yaml", "my_rgi/rig.yaml"])
-def test_a_rig_whose_name_is_mistyped_is_no_bare_board(calib, tmp_path, name: str) -> None:
-    ended = calib("firmware", "--rig", tmp_path / name, "-o", tmp_path / "out")
+@pytest.mark.parametrize(
+    ("verb", "name", "hint"),
+    [
+        (("firmware", "-o", "out"), "rigg.yaml", "; did you mean rig.yaml?"),
+        (("firmware", "-o", "out"), "my_rgi/rig.yaml", ""),
+        # These write into the rig's file, and live on what is in it.
+        (("control", "tune"), "rigg.yaml", "; did you mean rig.yaml?"),
+        (("distortion",), "rigg.yaml", "; did you mean rig.yaml?"),
+    ],
+)
+def test_a_rig_whose_name_is_mistyped_is_no_bare_board(calib, rig, verb, name: str, hint: str) -> None:
+    ended = calib(*verb, "--rig", name, cwd=rig.parent)
     assert ended.code == 3
-    assert ended.sentence == f"{tmp_path / name}: cannot be read: there is no such file"
-    assert not (tmp_path / "out").exists()
+    assert ended.sentence == f"{name}: cannot be read: there is no such file{hint}"
+    assert not (rig.parent / "out").exists() and not (rig.parent / name).exists()
 
 
 def test_a_number_that_no_float_holds(calib, rig) -> None:

@@ -86,6 +86,8 @@ def test_whole_folder_killed_rerun_and_changed(folder: Path, tmp_path: Path) -> 
     again = subprocess.run(_words(folder, other, "--jobs", "1"), capture_output=True, text=True, check=False)
     assert "interrupted" in again.stderr and "as before" in again.stderr
     assert again.returncode == done.returncode
+    wanted = told["decision"]["record_next"]
+    assert [line[8:] for line in again.stdout.splitlines() if line.startswith("  next: ")][:3] == wanted[:3]
     assert _public(other) == _public(out)
     for child in children:
         with pytest.raises(ProcessLookupError):

@@ -30,8 +30,7 @@ from calib.cli.simulate import simulate
 from calib.core.bounded_yaml import load
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
-from calib.io.columns import COLUMNS
-from calib.io.states import STATES
+from calib.io.columns import COLUMNS, STATES
 from calib.twin.scenarios import SCENARIOS
 
 ROOT = Path(__file__).resolve().parents[2]

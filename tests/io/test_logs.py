@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
 from calib.io import logs, tables
+from calib.io.columns import STATES
 from calib.io.logs import Log, check_time, iter_log, log_text, read_log, write_log
-from calib.io.states import ENDINGS, STATES, states_writer
+from calib.io.states import ENDINGS, states_writer
 from calib.io.tables import GENERAL, TIME, WHOLE, read_cells, table_bytes
 
 SMALL = (
@@ -123,6 +124,7 @@ def test_what_is_written_is_read(
     [
         ("", "log.csv: is empty, expected a header and rows"),
         ("t_s,ax_mps2\n", "log.csv: has a header but no rows"),
+        ("t_s,q1_m,q2_m,dq1_mps,dq2_mps,phi_rad\n0,1,1,0,0,0\n", "log.csv: holds states that calib replay"),
         ("a;ax_mps2\n1;2\n", "line 1: has no column t_s, found 'a, ax_mps2'.*the line t_s: {column: NAME"),
         ("t_s,ax_mps2\n0,1\n1,abc\n", "line 3: ax_mps2 is 'abc', expected a number"),
         ("t_s,ax_mps2\n0,1\n,2\n", "line 3: has no time t_s, expected a number"),

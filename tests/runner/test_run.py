@@ -25,6 +25,7 @@ from running_trials import CALLS, Inline, exit_code, make_folder, run_small
 from calib.core.errors import BadInputError
 from calib.core.rig import KINDS
 from calib.core.workers import Task
+from calib.io.columns import STATES
 from calib.runner.decision import read_summary
 from calib.runner.folder import read_folder
 from calib.runner.graph import HIDDEN, STEPS, Job, Runner, opened_run
@@ -414,12 +415,15 @@ def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
         "rig.yml",
     ):
         (root / name).write_text("")
-    said = read_folder(root).left_out
-    assert [sentence.split(" left out")[0] for sentence in said] == [
+    (root / "logs" / "states.csv").write_text(f"{','.join(STATES)}\n")
+    read = read_folder(root)
+    assert [sentence.split(" left out")[0] for sentence in read.left_out] == [
         "rig.yml: was",
         "images/: day1",
         "logs/: swing1.txt, tag1",
+        "logs/: states that calib replay has written,",
     ]
+    assert [log.slug for log in read.logs] == ["one", "two"]
     other = tmp_path / "other"
     (other / "Images").mkdir(parents=True)
     if not (other / "images").is_dir():

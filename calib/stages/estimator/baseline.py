@@ -22,7 +22,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
-from calib.io.states import BASELINE
+from calib.io.columns import BASELINE
 from calib.stages.actuator.kinematics import inverse_coefficients
 from calib.stages.camera.model import Camera
 from calib.stages.camera.pose import homography_with_lens

@@ -31,9 +31,9 @@ from calib.core.result import finite_or_none, judged
 from calib.core.rig import Rig
 from calib.core.stage import ProgressCall
 from calib.core.verdict import Finding, Severity, Verdict
-from calib.io.columns import Passed
+from calib.io.columns import BASELINE, STATES, Passed
 from calib.io.logs import Log, Watch
-from calib.io.states import BASELINE, STATES, states_writer
+from calib.io.states import states_writer
 from calib.solve.clock import clock_step_s
 from calib.stages.estimator.baseline import Baseline
 from calib.stages.estimator.consistency import SENSORS, SETTLED_S, Tally
