@@ -9,7 +9,7 @@ import glob
 import importlib
 import inspect
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +64,7 @@ def expanded(sources: Any) -> tuple[Path, ...]:
         if not matches:
             raise BadInputError(f"{text}: matches no file")
         return tuple(Path(one) for one in matches)
-    if not isinstance(sources, Sequence):
+    if not isinstance(sources, Iterable):
         raise UsageError(f"found {type(sources).__name__}, expected a path, a pattern, or several of them")
     return tuple(path for one in sources for path in expanded(one))
 

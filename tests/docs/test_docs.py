@@ -31,6 +31,7 @@ from calib.core.bounded_yaml import load
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
 from calib.io.columns import COLUMNS, STATES
+from calib.stages import expanded
 from calib.twin.scenarios import SCENARIOS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,13 +126,19 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
         (lambda: calib.intrinsics("images", square_m=-0.02), "square_m=-0.02 is not positive"),
         (lambda: calib.intrinsics("images", square_m=math.nan), "square_m=nan is not a number with a unit"),
         (lambda: calib.intrinsics([]), "intrinsics: found no paths; it takes: A folder of pictures"),
-        (lambda: calib.intrinsics(np.zeros((48, 64))), "found ndarray, expected a path"),
+        (lambda: calib.intrinsics(np.zeros((48, 64))), "found float64, expected a path"),
         (lambda: calib.plots(None), "plots: found NoneType, expected a result"),
     ],
 )
 def test_what_a_function_cannot_take_is_one_sentence(call: Callable[[], object], sentence: str) -> None:
     with pytest.raises(UsageError, match=re.escape(sentence)):
         call()
+
+
+def test_paths_may_come_from_a_generator(tmp_path: Path) -> None:
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).touch()
+    assert set(expanded(tmp_path.glob("*.csv"))) == {tmp_path / "a.csv", tmp_path / "b.csv"}
 
 
 def test_the_readme_shows_what_its_first_command_prints() -> None:
