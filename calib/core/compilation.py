@@ -30,7 +30,7 @@ _LOOK_AGAIN_S = 0.02
 
 
 _PACKAGE = Path(__file__).parents[1]
-_IMPORTS = re.compile(r"^from calib\.([\w.]+) import (.*)$", re.MULTILINE)
+_IMPORTS = re.compile(r"^from calib\.([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
 
 
 @cache
@@ -41,7 +41,10 @@ def _sources(path: Path) -> frozenset[Path]:
         modules = set()
         for package, names in _IMPORTS.findall(new.pop().read_text(encoding="utf-8")):
             folder = _PACKAGE.joinpath(*package.split("."))
-            modules |= {folder.with_suffix(".py"), *(folder / f"{name}.py" for name in names.split(", "))}
+            modules |= {
+                folder.with_suffix(".py"),
+                *(folder / f"{name}.py" for name in re.findall(r"\w+", names)),
+            }
         new += [module for module in modules - found if module.is_file()]
         found |= modules
     return frozenset(one for one in found if one.is_file())

@@ -313,6 +313,12 @@ def test_what_is_kept_is_compiled_anew_after_a_change_of_what_it_imports(file: s
     assert stages / made_from in compilation._sources(stages / file)
 
 
+def test_imports_in_parentheses_and_by_another_name_are_followed(tmp_path: Path) -> None:
+    file, core = tmp_path / "kernel.py", Path(compilation.__file__).parent
+    file.write_text("from calib.core import (\n    arrays,\n    units as u,\n)\n")
+    assert {core / "arrays.py", core / "units.py"} <= compilation._sources(file)
+
+
 def test_of_two_processes_that_need_a_function_one_compiles_it(tmp_path: Path) -> None:
     (tmp_path / "compiled_once.py").write_text(
         "from calib.core.compilation import kernel, on_compiling\n"
