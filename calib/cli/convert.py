@@ -40,7 +40,7 @@ def convert(
     from calib.io.states import states_writer
 
     check_log_name(output)
-    note_inputs([log, *beside(log), *(path for path in (stated.columns, stated.topics) if path is not None)])
+    note_inputs([log, *beside(log), *stated.files])
     check_writable(output, LOG)
     if save_columns is not None:
         check_writable(save_columns, COLUMNS_FILE)

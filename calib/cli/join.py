@@ -50,10 +50,7 @@ def join(
     if offset is not None and not math.isfinite(offset):
         raise UsageError(f"--offset: is {offset}, expected seconds")
     check_log_name(output)
-    files = [stated.columns, stated.topics]
-    note_inputs(
-        [camera, board, *beside(camera), *beside(board), *(path for path in files if path is not None)]
-    )
+    note_inputs([camera, board, *beside(camera), *beside(board), *stated.files])
     check_writable(output, LOG)
     known = Rig.load(rig, missing_ok=True)
     given = 0.0 if same_clock else offset

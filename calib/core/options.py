@@ -57,6 +57,11 @@ class LogOptions:
         None, "Which topic of a bag is which column, else NAME.topics.yaml beside the bag."
     )
 
+    @property
+    def files(self) -> list[Path]:
+        """Files that are read beside the logs."""
+        return [path for path in (self.columns, self.topics) if path is not None]
+
 
 @dataclass(frozen=True)
 class PoseOptions(LogOptions):

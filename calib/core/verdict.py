@@ -93,9 +93,14 @@ class Verdict:
 
     def __str__(self) -> str:
         """As the terminal shows it."""
+        return "\n".join(LEADS.get(kind, "") + text for kind, text in self.lines)
+
+    @property
+    def lines(self) -> list[tuple[str, str]]:
+        """Kind and text: the word, then the reasons, the remarks and the advice."""
         lists = {"reason": self.reasons, "remark": self.remarks, "advice": self.advice}
-        said = [LEADS[kind] + text for kind, texts in lists.items() for text in texts]
-        return "\n".join([f"verdict: {self.word}", *said])
+        said = [(kind, text) for kind, texts in lists.items() for text in texts]
+        return [("verdict", f"verdict: {self.word}"), *said]
 
 
 LEADS = {"reason": "  - ", "remark": "  (remark) ", "advice": "  next: "}

@@ -129,12 +129,7 @@ def _fact(value: Any, bar: Any, scale: float, places: int | None) -> str:
 
 def of_verdict(verdict: Verdict) -> list[Line]:
     """The verdict's word and sentences."""
-    return [
-        Line(f"verdict: {verdict.word}", "verdict"),
-        *(Line(text, "reason") for text in verdict.reasons),
-        *(Line(text, "remark") for text in verdict.remarks),
-        *(Line(text, "advice") for text in verdict.advice),
-    ]
+    return [Line(text, kind) for kind, text in verdict.lines]
 
 
 Rows = list[tuple[str, ...]]
