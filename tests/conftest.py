@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections import Counter
 from collections.abc import Generator
@@ -21,6 +22,9 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 # from writing it: each took up to 2 s to compile `calib` again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# A shell's script has what it starts with `&` ignore Ctrl-C, and the commands that tests start inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # In CI the same examples each time, so that a change is judged by what it changed; elsewhere always new ones.
 settings.register_profile("ci", derandomize=True)

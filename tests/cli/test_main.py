@@ -222,8 +222,6 @@ def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> Non
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # An earlier test may have left this process deaf to Ctrl-C, which a child inherits.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  one call
     )
     assert started.stdout is not None
     assert started.stdout.readline().startswith("searching")
@@ -275,7 +273,6 @@ def test_an_interruption_is_answered_within_two_seconds(environment, tmp_path, b
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  one call
     )
     assert started.stdout is not None
     assert started.stdout.readline().startswith("in a")

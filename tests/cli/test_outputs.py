@@ -179,7 +179,6 @@ def test_a_write_that_is_ended_leaves_nothing(environment, tmp_path: Path, how: 
     """A killed process leaves what the next write into the folder removes; one at work keeps its own."""
     script = (
         "import signal, sys, time\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         # Tests under nohup inherit a signal that is not heard.
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "from calib.io import states\n"

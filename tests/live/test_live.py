@@ -835,7 +835,6 @@ def test_ctrl_c_ends_with_the_camera_however_long_that_takes(tmp_path: Path) -> 
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  one call
     )
     assert started.stdout is not None
     assert started.stdout.readline().startswith("serving")
