@@ -289,10 +289,16 @@ def _dense_covariance(normal: np.ndarray, G: int, variance: float) -> np.ndarray
     return variance * np.linalg.inv(H)
 
 
-def test_blocks_equal_the_dense_inverse() -> None:
+@pytest.mark.parametrize("moved", [[], [[14.0, 13.0, -4.0, 3.0, 0.01, -0.02]]])
+def test_blocks_equal_the_dense_inverse(moved: list[list[float]]) -> None:
     fit = calibrate(pack(views_of(6, 2, 0.2)), (640, 480), "radial2")
-    found = covariance(fit)
+    found = covariance(fit, shifts=[np.array(shift) for shift in moved])
     dense = _dense_covariance(fit.normal, 6, fit.sigma_px**2)
+    for shift in moved:
+        # The poses follow the intrinsics as least squares has them do.
+        poses = -np.linalg.solve(fit.normal[:, 6:, 6:], (fit.normal[:, 6:, :6] @ shift)[..., None])
+        whole = np.concatenate([shift, poses.ravel()])
+        dense += np.outer(whole, whole)
     np.testing.assert_allclose(found.intrinsics, dense[:6, :6], rtol=1e-7)
     # The common motion is the one that best explains the change of the poses.
     V, motion = fit.normal[:, 6:, 6:], np.zeros((6, 6, 6))

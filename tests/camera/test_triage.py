@@ -12,7 +12,7 @@ from sets import SIZES, SPOILS, Recipe, camera_of, sheared, take
 
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture, usual_size
-from calib.stages.camera.bundle import calibrate, covariance, refitted
+from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px, refitted
 from calib.stages.camera.checks import drift, evidence, overdispersion
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Intrinsics, calibrate_camera
@@ -200,6 +200,9 @@ def test_a_board_that_is_not_as_described_blames_no_view_and_is_in_sigma(recipe:
         sigma = found.covariance.sigma()
         z += [(found.calibration.camera.fx_px - camera.fx_px) / sigma["fx_px"]]
         z += [(found.calibration.camera.cx_px - camera.cx_px) / sigma["cx_px"]]
+        # The poses take up most of what the intrinsics move by: 3 to 10 px of a centre.
+        at = np.array([[200.0, 150.0], [320.0, 240.0], [440.0, 330.0]])
+        assert np.max(projection_sigma_px(found.calibration, found.covariance, at)) < 0.5
     assert np.abs(z).max() < 3.0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -731,12 +732,15 @@ class Covariance:
         return dict(zip(self.names, bounded.tolist(), strict=True))
 
 
-def covariance(calibration: Calibration, variance_px2: float | None = None) -> Covariance:
+def covariance(
+    calibration: Calibration, variance_px2: float | None = None, shifts: Sequence[FloatArray] = ()
+) -> Covariance:
     """Covariance of the intrinsics and the common motion, everything else that was estimated following.
 
     Parameters
     ----------
     variance_px2 : variance of one measured coordinate; from the residuals by default.
+    shifts : (P,) each, one standard deviation of what else may move the intrinsics, and the poses with them.
     """
     variance = calibration.sigma_px**2 if variance_px2 is None else variance_px2
     H = calibration.normal
@@ -769,12 +773,15 @@ def covariance(calibration: Calibration, variance_px2: float | None = None) -> C
     F = np.linalg.solve(total, weighted)
     of_shared = -np.einsum("nab,nbg->ag", F, E)
     own = np.einsum("nab,nbc,ndc->ad", F, V_inverse, F)
+    shared = variance * S_inverse
+    for shift in shifts:
+        shared[:P, :P] += np.outer(shift, shift)
     joint = np.zeros((P + 6, P + 6))
-    joint[:P, :P] = S_inverse[:P, :P]
-    joint[P:, :P] = (of_shared @ S_inverse)[:, :P]
+    joint[:P, :P] = shared[:P, :P]
+    joint[P:, :P] = (of_shared @ shared)[:, :P]
     joint[:P, P:] = joint[P:, :P].T
-    joint[P:, P:] = of_shared @ S_inverse @ of_shared.T + own
-    return Covariance(calibration.free_names, variance * S_inverse[:P, :P], variance * joint, distance)
+    joint[P:, P:] = of_shared @ shared @ of_shared.T + variance * own
+    return Covariance(calibration.free_names, shared[:P, :P], joint, distance)
 
 
 def joint_jacobian(calibration: Calibration, points_C: FloatArray) -> FloatArray:

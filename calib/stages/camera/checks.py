@@ -511,6 +511,11 @@ class TargetShape:
         """Whether the target is not what it is said to be."""
         return bool(np.any(np.abs(self.values) > _CERTAIN * self.sigma))
 
+    @property
+    def bent(self) -> bool:
+        """Whether it is not flat."""
+        return bool(np.any(np.abs(self.values[2:]) > _CERTAIN * self.sigma[2:]))
+
 
 def _basis(calibration: bundle.Calibration) -> tuple[FloatArray, float]:
     """Displacements (5, 3, M) or (N, 5, 3, M) of the points, and half the target's longer side."""
@@ -562,6 +567,15 @@ def target_shape(calibration: bundle.Calibration) -> TargetShape | None:
     )
 
 
+def certain_shape(calibration: bundle.Calibration) -> TargetShape | None:
+    """The target's shape where it is certainly another than the one described."""
+    try:
+        shape = target_shape(calibration) if np.all(np.isfinite(calibration.normal)) else None
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return shape if shape is not None and shape.certain else None
+
+
 def drift(calibration: bundle.Calibration) -> FloatArray | None:
     """RMS change (P,) of the intrinsics about their mean, where they run evenly from view to view; else None.
 
@@ -585,6 +599,29 @@ def drift(calibration: bundle.Calibration) -> FloatArray | None:
     left = max(calibration.squared_sum - float(gain(S, b)), 0.0) / max(calibration.degrees_of_freedom - P, 1)
     sigma = np.sqrt(np.maximum(np.diag(inverse)[-P:], 0.0) * left) * overdispersion(about)
     return step / math.sqrt(3.0) if bool(np.any(np.abs(step) > _CERTAIN * sigma)) else None
+
+
+_TELL_SHAPE = 4
+"""Views from which on the board's shape is told from the poses."""
+
+
+def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
+    """The covariance by which the views really scatter.
+
+    Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
+    noise of their corners would let them: two to three times as much on real pictures. A board that is not
+    as described moves the camera by as much as it would if the board's shape were estimated too, and one that
+    changes from view to view is another by as much.
+    """
+    moved: list[FloatArray] = []
+    try:
+        inflation = overdispersion(evidence(calibration, calibration.basis))
+        if calibration.basis is None and calibration.observations.views >= _TELL_SHAPE:
+            shape, ran = certain_shape(calibration), drift(calibration)
+            moved = [one for one in (None if shape is None else shape.shift, ran) if one is not None]
+    except (np.linalg.LinAlgError, ValueError):
+        inflation = 1.0
+    return bundle.covariance(calibration, (inflation * calibration.sigma_px) ** 2, moved)
 
 
 # ----------------------------------------------------------------------

@@ -579,14 +579,14 @@ def calibrate_camera(
     if fit.termination == "behind the camera":
         raise _no_camera(fit.observations, "a solution has points behind the camera")
     solved = time.perf_counter()
-    sigma = _by_the_views(fit)
+    sigma = checks.by_the_views(fit)
     covered = time.perf_counter()
     findings += of_copies(copies)
     verdict = _judged(fit, findings)
     if shared and verdict.word in ("ok", "poor"):
         verdict = _judged(fit, [*findings, *shared])
     if verdict.word == "unidentifiable" and (better := checks.best_of_starts(fit)) is not fit:
-        fit, sigma = better, _by_the_views(better)
+        fit, sigma = better, checks.by_the_views(better)
         verdict = _judged(fit, findings)
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
@@ -617,22 +617,13 @@ def without_copies(
     return observations.select(sorted(own.values())), copies
 
 
-def _shape(fit: Calibration) -> checks.TargetShape | None:
-    """The board's shape where it is certainly another than the one described."""
-    try:
-        shape = checks.target_shape(fit) if np.all(np.isfinite(fit.normal)) else None
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    return shape if shape is not None and shape.certain else None
-
-
 def _on_its_board(fit: Calibration) -> Calibration:
     """The fit to a board of the shape that all views tell, or the same.
 
     A bow or a stretch moves the principal point of a view with its tilt, as another camera or a picture that
     was turned does.
     """
-    shape = _shape(fit)
+    shape = checks.certain_shape(fit)
     return fit if shape is None else checks.straightened(fit, shape.displacement_m)
 
 
@@ -641,7 +632,7 @@ def _screened(fit: Calibration) -> Triage:
     found = triage(fit)
     everything, gone = fit.observations, {one.name for one in found.left_out if one.kind == "view"}
     for source in (fit, found.calibration) if gone else ():
-        shape = _shape(source)
+        shape = checks.certain_shape(source)
         other = None if shape is None else triage(checks.straightened(fit, shape.displacement_m))
         leaving = {one.name for one in other.left_out if one.kind == "view"} if other else gone
         if other is None or len(leaving) >= len(gone):
@@ -716,33 +707,6 @@ def _better_for_most(lens: str, models: Sequence[Candidate]) -> Candidate | None
     best = min(models, key=lambda one: np.nan_to_num(medians[one.name], nan=np.inf), default=None)
     far = best is not None and medians[best.name] < _FAR_BETTER * medians.get(lens, np.inf)
     return best if far else None
-
-
-_TELL_SHAPE = 4
-"""Views from which on the board's shape is told from the poses."""
-
-
-def _by_the_views(fit: Calibration) -> Covariance:
-    """The covariance by which the views really scatter.
-
-    Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
-    noise of their corners would let them: two to three times as much on real pictures. A board that is not
-    as described moves the camera by as much as it would if the board's shape were estimated too, and one that
-    changes from view to view is another by as much.
-    """
-    try:
-        inflation = checks.overdispersion(checks.evidence(fit, fit.basis))
-        tells = fit.basis is None and fit.observations.views >= _TELL_SHAPE
-        shape, ran = (_shape(fit), checks.drift(fit)) if tells else (None, None)
-    except (np.linalg.LinAlgError, ValueError):
-        inflation, shape, ran = 1.0, None, None
-    known = covariance(fit, (inflation * fit.sigma_px) ** 2)
-    for shift in (None if shape is None else shape.shift, ran):
-        if shift is not None:
-            joint, P = known.joint.copy(), len(shift)
-            joint[:P, :P] += np.outer(shift, shift)
-            known = replace(known, intrinsics=known.intrinsics + np.outer(shift, shift), joint=joint)
-    return known
 
 
 def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:

@@ -246,11 +246,12 @@ def _of_richer(fit: bundle.Calibration, wide: bundle.Calibration) -> Iterator[Fi
         yield Finding("poor" if serious else "remark", text, "Use a richer lens model.")
 
 
-def _of_projection(fit: bundle.Calibration, known: bundle.Covariance, inflation: float) -> Iterator[Finding]:
-    """Standard deviation of projection, inflated, where points were seen."""
+def _of_projection(fit: bundle.Calibration) -> Iterator[Finding]:
+    """Standard deviation of projection where points were seen."""
     outline = checks.hull(fit.observations.pixels[fit.observations.present])
     grid = box_grid([*outline.min(axis=0), *outline.max(axis=0)], 14, 12).reshape(-1, 2)
-    spread = inflation * bundle.projection_sigma_px(fit, known, grid[checks.inside_hull(grid, outline)])
+    inside = grid[checks.inside_hull(grid, outline)]
+    spread = bundle.projection_sigma_px(fit, checks.by_the_views(fit), inside)
     bounded = spread[~np.isnan(spread)]
     sigma_px = float(np.median(bounded)) if len(bounded) else np.inf
     limit = Limits.projection_share * max(fit.camera.image_size_px)
@@ -266,16 +267,14 @@ def _of_projection(fit: bundle.Calibration, known: bundle.Covariance, inflation:
 
 
 def _of_border(fit: bundle.Calibration, sturdy: bundle.Calibration) -> Iterator[Finding]:
-    """Standard deviation of projection, inflated, at the points of the border that the lens can show.
+    """Standard deviation of projection at the points of the border that the lens can show.
 
     The denominator of the rational model counts, unless nothing bounds it.
     """
-    known = bundle.covariance(fit)
+    known = checks.by_the_views(fit)
     if not np.all(np.isfinite(known.joint)):
-        fit, known = sturdy, bundle.covariance(sturdy)
-    sigma_px = checks.overdispersion(checks.evidence(fit)) * bundle.projection_sigma_px(
-        fit, known, checks.image_outline(fit.camera)
-    )
+        fit, known = sturdy, checks.by_the_views(sturdy)
+    sigma_px = bundle.projection_sigma_px(fit, known, checks.image_outline(fit.camera))
     sigma_px = sigma_px[~np.isnan(sigma_px)]
     limit = Limits.border_share * max(fit.camera.image_size_px)
     if len(sigma_px) and (most := float(sigma_px.max())) > limit:
@@ -683,16 +682,16 @@ def _of_target(found: checks.TargetShape | None, calibration: bundle.Calibration
         yield Finding("remark" if cleared else "poor", text, advice)
     bend, moved = found.bow_m / found.size_m, abs(found.focal_shift)
     certain = found.bow_significance > Limits.bow_sigma
-    if certain and (bend > Limits.bow_remark or moved > Limits.bow_focal_remark):
+    if (certain or found.bent) and (bend > Limits.bow_remark or moved > Limits.bow_focal_remark):
         text = (
             f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
             f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
             f"{100 * Limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %"
             f"{allowed}."
         )
-        kind: Severity = (
-            "inconsistent" if bend > Limits.bow_bad else "poor" if moved > Limits.bow_focal else "remark"
-        )
+        kind: Severity = "remark"
+        if certain:
+            kind = "inconsistent" if bend > Limits.bow_bad else "poor" if moved > Limits.bow_focal else kind
         advice = "Glue the board to a flat plate, or let its shape be fitted (--board warp)."
         yield Finding(kind, text, advice)
     elif found.focal_per_bow > Limits.fragile:
@@ -751,15 +750,16 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     sturdy = checks.conditioned(fit)
     if sturdy is not fit:
         findings += _of_denominator(_focal_share(fit, bundle.covariance(fit)))
-    known, inflation = bundle.covariance(sturdy), checks.overdispersion(checks.evidence(sturdy))
-    share = _focal_share(sturdy, known)
+    inflation = checks.overdispersion(checks.evidence(sturdy))
+    # What a board of another shape moves is a matter of the board, and told of that.
+    share = _focal_share(sturdy, bundle.covariance(sturdy))
     if calibration.basis is not None:
         # A target that was deformed to fit costs certainty, which the rigid target in its shape hides.
         share = max(share, _focal_share(calibration, bundle.covariance(calibration)))
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
-    findings += _of_projection(sturdy, known, inflation)
+    findings += _of_projection(sturdy)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = checks.widened(some)
     shape = checks.target_shape(wide)
