@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -14,7 +15,7 @@ from calib.cli.common import JsonOption, document, narrate, progress_bar, say, s
 from calib.core.errors import EXIT_POOR, UsageError
 from calib.core.files import shown
 from calib.core.units import parse_duration_s
-from calib.core.words import counted
+from calib.core.words import BLANK, counted, short
 
 if TYPE_CHECKING:
     from calib.core.workers import Processes
@@ -246,6 +247,10 @@ def sweep(
         raise typer.Exit(EXIT_POOR)
 
 
+_MEASURES = 5
+"""For a terminal; the page has them all."""
+
+
 def _tell_sweep(summary: SweepSummary) -> None:
     parts = [counted(summary.cases, "case")]
     if summary.as_before:
@@ -253,17 +258,19 @@ def _tell_sweep(summary: SweepSummary) -> None:
     if summary.failed:
         parts.append(f"{summary.failed} failed, the first: {summary.why}")
     say("; ".join(parts))
+    if not summary.best and summary.cases > summary.failed:
+        say(f"no case has a value of {summary.measure}")
     for title, points in (("best", summary.best[:5]), ("worst", summary.worst[:5])):
         if not points:
             continue
         names = list(points[0].parameters)
-        head = [title, *names, f"{summary.measure}, median", "worst draw"]
+        head = [title, *names, f"{summary.measure}, median", "worst draw", *summary.measures[1:_MEASURES]]
         rows = [
             [
                 f"#{point.point}",
                 *(_text(value) for value in point.parameters.values()),
-                f"{point.median:.4g}",
-                f"{point.worst:.4g}",
+                *map(_text, (point.median, point.worst)),
+                *(_text(point.measures[name]) for name in summary.measures[1:_MEASURES]),
             ]
             for point in points
         ]
@@ -271,4 +278,6 @@ def _tell_sweep(summary: SweepSummary) -> None:
 
 
 def _text(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return short(value) if math.isfinite(value) else BLANK

@@ -518,7 +518,8 @@ def _table(store: outcomes.Store, spec: Sweep) -> tuple[Any, tuple[str, ...]]:
         raise BadInputError(
             f"measure: {one_line(unknown)} was not measured, expected some of {', '.join(found)}"
         )
-    measures = tuple(name for name in spec.measure or found if name in found)
+    told = [name for name in found if np.isfinite(outcomes.column(whole, name)).any()]
+    measures = tuple(name for name in spec.measure or told if name in found)
     kinds = dict.fromkeys(first[:3], "int64") | {"sentence": "string"}
     kinds |= {name: "string" for name, one in numbers.items() if not one}
     return outcomes.typed(whole, [*first, *measures, "sentence"], kinds), measures

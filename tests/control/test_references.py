@@ -179,7 +179,8 @@ def test_a_recorded_log_is_a_reference(make: Make) -> None:
     ("text", "sentence"),
     [
         ("", "is empty, expected a header"),
-        ("t_s,q1_m\n0,1\n", "has no reference in it"),
+        ("t_s,q1_m\n0,1\n", "has no reference in it, found t_s, q1_m; expected in metres q1_m and"),
+        ("t_ms,q1_m,q2_m\n0,1,1\n", "has no column t_s, found t_ms, q1_m, q2_m; expected a reference"),
         ("t_s,q1_m,q2_m\n0,0.07,\n", "line 2: q2_m is blank or nan"),
         ("t_s,q1_m,q2_m\n0,0.07,0.07\n1,0.07,0.07\n0.5,0.07,0.07\n", "line 4: t_s is 0.5 after 1"),
         ("t_s,q1_m,q2_m\n0,0.07,0.07\n5,0.07,0.07\n", "has 2 rows over 5 s"),

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
+from calib.cli.fleet import _tell_sweep
 from calib.core.errors import BadInputError
 from calib.core.workers import Failure, Task
 from calib.runner import sweep as sweeping
@@ -77,7 +78,7 @@ SPEC = Sweep.model_validate(
         "base": {"scenario": "orientation", "feedback": "truth", "duration": "1s"},
         "grid": {"scenario.Kp": [1.0, 2.0, 3.0], "scenario.controller": ["p", "pid"]},
         "draws": {"count": 4, "actuator.mass_kg": {"uniform": [0.04, 0.06]}},
-        "measure": ["error"],
+        "measure": ["error", "other"],
     }
 )
 
@@ -96,7 +97,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweeping, "run_case", bowl)
 
 
-def test_best_worst_and_resumed(tmp_path: Path) -> None:
+def test_best_worst_and_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with opened_store(tmp_path / "out", "calib sweep", ()) as (store, _):
         assert run_sweep(store, Here(), SPEC)["same"] == 0
         found = summarise_sweep(store, SPEC, 0)
@@ -104,7 +105,10 @@ def test_best_worst_and_resumed(tmp_path: Path) -> None:
         best = found.best[0]
         assert best.parameters == {"scenario.Kp": 2.0, "scenario.controller": "pid"}
         assert (best.draws, best.median, best.worst) == (3, pytest.approx(0.01), pytest.approx(0.02))
-        assert best.measures == {"error": pytest.approx(0.01)}
+        assert best.measures == {"error": pytest.approx(0.01), "other": 2.0}
+        _tell_sweep(found)
+        _, head, first, *_ = capsys.readouterr().out.splitlines()
+        assert head.split()[-3:] == ["worst", "draw", "other"] and first.split()[-3:] == ["0.01", "0.02", "2"]
         assert found.best[0].loss < found.best[-1].loss and not found.worst
         # The page speaks in words.
         page = sweep_page_text(SPEC, found)

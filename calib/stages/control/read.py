@@ -11,6 +11,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.rig import Rig
+from calib.core.words import several
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.logs import columns_of
 from calib.io.tables import read_cells
@@ -23,7 +24,7 @@ from calib.stages.control.laws import Model
 #
 # A CSV with `t_s` and one of
 #
-#     q1_m, q2_m               lengths, as `calib replay --states` writes them
+#     q1_m, q2_m               lengths, as `calib replay` writes them
 #     true_q1_m, true_q2_m     those of a simulated log
 #     x_m, y_m                 the head in the plane
 #     phi_rad                  the angle alone
@@ -41,12 +42,15 @@ def _series(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     cells = read_cells(path)
     header = cells.header
     if "t_s" not in header:
-        raise BadInputError(f"{source}: has no column t_s, expected a reference with times")
+        raise BadInputError(
+            f"{source}: has no column t_s, found {several(header, 8)}; expected a reference with times in "
+            "seconds"
+        )
     names = next((kind for kind in _KINDS if all(name in header for name in kind)), None)
     if names is None:
         raise BadInputError(
-            f"{source}: has no reference in it, expected q1_m and q2_m, x_m and y_m, or phi_rad; of a "
-            "recorded log calib replay writes them"
+            f"{source}: has no reference in it, found {several(header, 8)}; expected in metres q1_m and q2_m "
+            "or x_m and y_m, or in radians phi_rad; of a recorded log calib replay writes them"
         )
     at = [header.index(name) for name in ("t_s", *names)]
     table = cells.numbers(*at)
@@ -92,7 +96,9 @@ def read_reference(path: Path, model: Model) -> references.Reference:
             f"{_FEWEST * h:.3g} s"
         )
     if span > references.LONGEST_S:
-        raise BadInputError(f"{source}: lasts {span:g} s, expected at most {references.LONGEST_S:g} s")
+        raise BadInputError(
+            f"{source}: lasts {span:g} s, expected at most {references.LONGEST_S:g} s; is t_s in ms?"
+        )
     ticks = references.resampled(t, values, h)
     if names == ("phi_rad",):
         try:

@@ -467,6 +467,8 @@ def _as_out(held: FloatArray) -> FloatArray:
 _NIS_FACTOR, _QUIET_FACTOR = 2.0, 20.0
 """Noise that is not white is followed: a gyroscope's that lasts 30 ms left innovations of .12 of what was
 expected, and angles as sure as they say. One in the wrong unit is quieter by a thousand."""
+_WIDE = 1.5
+"""Sigma that is too large by less is not told."""
 _GATED_SHARE = 0.05
 _INSIDE_SHARE = 0.7
 _CORRELATED = 0.6
@@ -523,12 +525,14 @@ def consistent(
         rest = (quiet or {}).get(name, 1.0)
         if check.nis is not None and check.inside is not None and check.correlation is not None:
             ratio = check.nis / check.degrees
-            if not 1.0 / (2.0 * _NIS_FACTOR) <= ratio <= _NIS_FACTOR:
-                # As at rest, or of a marker that is.
+            if not 1.0 / _WIDE**2 <= ratio <= _NIS_FACTOR:
+                # As at rest, or of a marker that is; and no state is given away for better than it is.
                 known = ratio < 1.0 and (name in _PLACES or ratio >= rest / _QUIET_FACTOR)
+                wide = f": its sigma, and that of the states, is up to {ratio**-0.5:.1f} times too large"
                 yield Finding(
                     "remark" if known else "poor",
                     f"the innovations of the {name} are {ratio:.2g} times what the covariance expects"
+                    + (wide if known else "")
                     + ("" if name == "pose" else "; calib replay --tune learns the noise of this rig"),
                 )
             # Below their band are innovations that are as quiet as at rest, and those of a marker that rests
