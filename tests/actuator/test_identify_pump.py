@@ -258,11 +258,12 @@ def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
     runs = [PumpRecord(f"run{k}", t, pwm, y + 0.02 * np.sin(40.0 * t + k)) for k in range(3)]
     runs.append(PumpRecord("odd", t, pwm, y + 6.0 * np.clip(t - 2.0, 0.0, 1.0)))
     odd = identify_pump([_table(r) for r in runs])
-    said = unexplained(odd)
+    said = [one.text for one in unexplained(odd)]
     assert "settle apart: 3 at 25.0 kPa" in said[0]
     assert "odd leaves the model" in said[1]
     assert "while the PWM stood still" in said[1]
-    assert judge_pump(odd).word == "poor"
+    verdict = judge_pump(odd)
+    assert verdict.word == "poor" and any("look for a leak" in one for one in verdict.advice)
     assert odd.main_group is not None
     assert odd.held_rms(LAG, odd.main_group.files) < odd.held_rms(LAG)
 

@@ -212,9 +212,10 @@ def test_springs_from_weights(calib: Run, tmp_path: Path) -> None:
         "mass_g,elongation_mm\n"
         + "".join(f"{m:.4f},{1e3 * e:.4f}\n" for m, e in zip(mass_g, eps, strict=True))
     )
+    rig.write_text("schema: 2\nactuator: {verdict: ok, remarks: [of logs], advice: [another log]}\n")
     ended = calib("identify", "stiffness", path, "--rig", rig, "--figures", tmp_path / "f")
     assert ended.code == 0
-    assert "order 2 (used)" in ended.out
+    assert "order 2 (used)" in ended.out and "of logs" not in ended.out and "next:" not in ended.out
     section = yaml.safe_load(rig.read_text())["actuator"]
     assert section["k0_N_per_m"] == pytest.approx(47.7, rel=1e-3)
     assert (tmp_path / "f" / "identify_stiffness.png").exists()

@@ -399,6 +399,8 @@ def test_pictures_from_before_or_long_after_the_sample_are_refused() -> None:
         match = rf"align\.time_offset_s is .* expected pictures that are -1 to 8.*{advice}"
         with pytest.raises(BadInputError, match=match):
             header_of(_with("align", time_offset_s=offset_s), "rig.yaml")
+    with pytest.raises(BadInputError, match=r"to 8 ticks late; align is unidentifiable, so that its numbers"):
+        header_of(_with("align", time_offset_s=0.15, word_="unidentifiable"), "rig.yaml")
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.05, -1.2, 2.5])

@@ -1662,22 +1662,21 @@ class Prospect:
 
 
 def _experiments(rest_length_m: float, tick_s: float) -> tuple[Experiment, ...]:
-    """Static, swing, step, ellipse and elongation, open-loop stand-ins of the source's experiments."""
+    """Eight seconds of what `calib record --do` has a rig do, by its names there."""
     n = round(_DURATION_S / tick_s)
     t = tick_s * np.arange(n, dtype=np.float64)
     off, straight = np.zeros((n, 2)), Start(0.0, rest_length_m)
-    step = np.where((t >= 0.5) & (t < 0.6 * _DURATION_S), 225.0, 0.0)
     turn = 2.0 * np.pi * t / (0.5 * _DURATION_S)
-    ellipse = np.stack([180.0 + 60.0 * np.sin(turn), 180.0 + 60.0 * np.cos(turn)], axis=1)
-    stairs = np.array([130.0, 175.0, 215.0, 250.0, 0.0])[np.minimum((5.0 * t / _DURATION_S).astype(int), 4)]
+    ellipse = 200.0 + 50.0 * np.stack([np.sin(turn), -np.sin(turn)], axis=1)
+    levels = np.array([[175.0, 175.0], [250.0, 250.0], [0.0, 0.0], [225.0, 0.0], [0.0, 0.0]])
+    steps = levels[np.minimum((5.0 * t / _DURATION_S).astype(int), 4)]
+    deflate = np.where(t[:, None] < 0.6 * _DURATION_S, 250.0, off)
     return (
         Experiment("static", "rest, pumps off", straight, True, off),
         Experiment("swing", "released from 0.5 rad, hoses off", Start(0.5, rest_length_m), False, off),
-        Experiment("step", "one pump on, then off", straight, True, np.stack([step, 0.0 * step], axis=1)),
-        Experiment("ellipse", "both pumps swept a quarter of a turn apart", straight, True, ellipse),
-        Experiment(
-            "elongation", "both pumps up in steps, then off", straight, True, np.stack([stairs] * 2, 1)
-        ),
+        Experiment("steps", "pumps on and off, both and each alone", straight, True, steps),
+        Experiment("ellipse", "slowly to both sides", straight, True, ellipse),
+        Experiment("deflate", "both pumps on, then off", straight, True, deflate),
     )
 
 
@@ -2104,8 +2103,8 @@ def judge(
     if next_ones:
         best = next_ones[0]
         advice = (
-            f"the experiment {best.name} ({best.what}) would leave {label_of(best.worst)} as the least "
-            f"known, to {100.0 * best.worst_relative:.2g} %"
+            f"calib record PORT -o {best.name}.csv --do {best.name} ({best.what}) would leave "
+            f"{label_of(best.worst)} as the least known, to {100.0 * best.worst_relative:.2g} %"
         )
         out.append(Finding("remark", "", advice))
     return Verdict.of(out)

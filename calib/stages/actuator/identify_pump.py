@@ -1051,9 +1051,13 @@ _PASSAGE = ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
 """What may be vague: parts of the passage make up for each other."""
 
 
-def unexplained(found: PumpFound) -> list[str]:
-    """Sentences on what no function of the PWM explains."""
-    out, unit = [], found.unit
+def unexplained(found: PumpFound) -> list[Finding]:
+    """What no function of the PWM explains, and what to do about it."""
+    out, unit = list[Finding](), found.unit
+
+    def add(text: str, advice: str) -> None:
+        out.append(Finding("poor", text, advice))
+
     main = found.main_group
     if main is not None:
         parts = [
@@ -1061,22 +1065,28 @@ def unexplained(found: PumpFound) -> list[str]:
             f"PWM {g.pwm[0]:.0f} .. {g.pwm[1]:.0f})"
             for g in found.groups
         ]
-        out.append(f"runs near full PWM settle apart: {'; '.join(parts)}; PWM does not say which")
+        add(
+            f"runs near full PWM settle apart: {'; '.join(parts)}; PWM does not say which",
+            "identify one group at a time: supply, valve and load differ between them",
+        )
     for d in found.departs:
         moved = "after the PWM had moved" if d.pwm_moved else "while the PWM stood still"
-        out.append(
-            f"{d.name} leaves the model {d.at_s:.2f} s after its start, {moved}, by {d.error:+.2f} {unit}"
+        add(
+            f"{d.name} leaves the model {d.at_s:.2f} s after its start, {moved}, by {d.error:+.2f} {unit}",
+            "look for a leak, a valve or a load that changed there; record it again, or cut it off before",
         )
     for name, size, before in found.leaps:
-        out.append(
+        add(
             f"{name} begins with a jump of {size:.1f} {unit} within 0.1 s from {before:.2f} {unit}, as if "
-            "the chamber had been under pressure behind a closed valve"
+            "the chamber had been under pressure behind a closed valve",
+            "let the chamber empty before a recording begins",
         )
     for m in found.maps:
         if m.fit.outliers_pwm:
             values = ", ".join(f"{u:g}" for u in m.fit.outliers_pwm)
-            out.append(
-                f"{m.name}: the settled values at PWM {values} lie off the map by more than four scatters"
+            add(
+                f"{m.name}: the settled values at PWM {values} lie off the map by more than four scatters",
+                "measure those again, and wait until they have settled",
             )
     return out
 
@@ -1084,7 +1094,7 @@ def unexplained(found: PumpFound) -> list[str]:
 def judge_pump(found: PumpFound) -> Verdict:
     """What nothing explains, how recordings that were not fitted are met, and what is hardly known."""
     remarks = [Finding("remark", text) for text in found.said]
-    return Verdict.of([*(Finding("poor", text) for text in unexplained(found)), *remarks, *_of_better(found)])
+    return Verdict.of([*unexplained(found), *remarks, *_of_better(found)])
 
 
 def _of_better(found: PumpFound) -> Iterator[Finding]:
@@ -1106,12 +1116,17 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
             "poor",
             f"on recordings not fitted the {better} is off by {rms:.2f} {found.unit} (RMS), "
             f"{100.0 * rms / span:.0f} % of the range",
+            "record each run from an empty chamber, with the same supply and load",
         )
     for name, sigma in fit.sigma.items():
         value = abs(fit.values[name])
         if name not in _PASSAGE and sigma > _MOST_VAGUE * value:
             known = f"known to {100.0 * sigma / value:.0f} % only" if sigma < value else "not told by these"
-            yield Finding("poor", f"{name} of the {better} is {known}: {fit.values[name]:.3g} +- {sigma:.2g}")
+            yield Finding(
+                "poor",
+                f"{name} of the {better} is {known}: {fit.values[name]:.3g} +- {sigma:.2g}",
+                "record steps of the PWM up and down, from rest, at 50 Hz or more",
+            )
     settles = found.settles(better)
     if settles is not None:
         level, half, inside, count = settles
@@ -1175,7 +1190,7 @@ def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
             "better": found.better,
             "static": {m.name: m.fit for m in found.maps},
             "groups": found.groups,
-            "unexplained": unexplained(found),
+            "unexplained": [one.text for one in unexplained(found)],
         }
     )
     return PumpSection.model_validate(before | update | {"sigma": sigma, "identified": identified})

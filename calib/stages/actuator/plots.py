@@ -13,7 +13,7 @@ from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound
 from calib.stages.actuator.results import Identified, simulated_heads
 from calib.stages.actuator.section import Actuator, PumpSection, label_of
 from calib.stages.actuator.stage import Springs, Validated
-from calib.stages.actuator.validate import IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
+from calib.stages.actuator.validate import CALLED, IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 
 _HUES = ("blue", "green", "orange", "grey")
 
@@ -190,7 +190,7 @@ def _runs(result: PumpFound) -> plot.Figure:
         marks = [plot.Curve(t, record.value, "measured", "points", "grey", 2.5)]
         for model, fit in result.fits.items():
             simulated = fit.run(record)
-            marks.append(plot.Curve(t, simulated, model, "line", _MODELS[model], 1.1))
+            marks.append(plot.Curve(t, simulated, CALLED[model], "line", _MODELS[model], 1.1))
             off = held[model].get(record.name, rms(simulated - record.value))
             errors.append(f"{off:.2f}")
         title = f"{plot.short(record.name, 20)}: {' / '.join(errors)}"
@@ -265,11 +265,13 @@ def _validation(one: Comparison) -> plot.Figure:
     known = [model for model, curves in one.simulated.items() if np.isfinite(curves).all()]
     rms = {model: {name: error.rms for name, error in one.errors[model].items()} for model in known}
     parts = [
-        f"{model} {plot.number(1e3 * of['q1'], 'mm')}, {plot.number(1e3 * of['q2'], 'mm')}, "
+        f"{CALLED[model]} {plot.number(1e3 * of['q1'], 'mm')}, {plot.number(1e3 * of['q2'], 'mm')}, "
         f"{plot.number(of['phi'], 'rad')}"
         for model, of in rms.items()
     ]
-    parts += [f"{model} unknown, it ends before the log" for model in one.simulated if model not in known]
+    parts += [
+        f"{CALLED[model]} unknown, it ends before the log" for model in one.simulated if model not in known
+    ]
     note = (
         "Points are from the log, lines are simulated from commands and start alone. RMS errors of q1, q2 "
         "and phi are, model by model: " + "; ".join(parts) + "."
@@ -284,7 +286,7 @@ def _validation(one: Comparison) -> plot.Figure:
         right: list[plot.Mark] = [plot.Rule("y", 0.0)]
         for model in known:
             simulated = scale * one.simulated[model][some, row]
-            left.append(plot.Curve(t, simulated, model, "line", _VALIDATED[model], 1.1))
+            left.append(plot.Curve(t, simulated, CALLED[model], "line", _VALIDATED[model], 1.1))
             right.append(plot.Curve(t, measured - simulated, "", "line", _VALIDATED[model], 0.9))
         x, limits = "time (s)" if row == len(QUANTITIES) - 1 else "", (float(t[0]), float(t[-1]))
         panels.append(plot.Plot(x, y, left, "" if row else "Curves", limits))

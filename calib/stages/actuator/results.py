@@ -266,6 +266,8 @@ def stiffness_section(fit: StiffnessFit, per_actuator: bool, rig: Rig) -> Actuat
     Stiffness(tuple(k))
     padded = k + [0.0] * (len(LAW) - len(k))
     before: dict[str, Any] = {"verdict": "ok"} if rig.actuator is None else section_json(rig.actuator)
+    # What calib identify remarked and advised is of its logs.
+    before = {key: value for key, value in before.items() if key not in ("remarks", "advice")}
     sigma = {key: value for key, value in before.get("sigma", {}).items() if key not in LAW}
     sigma |= {key: share * float(s) for key, s in zip(LAW, fit.sigma.tolist(), strict=False)}
     return Actuator.model_validate(before | dict(zip(LAW, padded, strict=True)) | {"sigma": sigma})

@@ -462,8 +462,8 @@ def _read_validate(
     tracks = [begun_track(files, path, rig, options, states) for path, states in logs]
     if IMPROVED not in models_of(rig):
         files.remarks.append(
-            f"{shown(files.rig_path)} has no section known, actuator or pump: the improved model has "
-            "nominal parameters"
+            f"{shown(files.rig_path)} has no section known, actuator or pump: the nominal model alone is "
+            "held against the log"
         )
     return tracks, (), rig
 
@@ -548,7 +548,7 @@ def _validate_words(outcome: Validated) -> list[Block]:
 
 
 def _errors(one: Comparison) -> Table:
-    from calib.stages.actuator.validate import ORIGINAL, QUANTITIES
+    from calib.stages.actuator.validate import CALLED, ORIGINAL, QUANTITIES
 
     rows = []
     for quantity in QUANTITIES:
@@ -557,7 +557,7 @@ def _errors(one: Comparison) -> Table:
             error = errors[quantity]
             gained = None if model == ORIGINAL else one.improvement_percent(quantity, model)
             cells = (_cell(scale * error.norm), _cell(scale * error.rms), _cell(error.fit_percent, ".1f"))
-            rows.append((f"{quantity}, {unit}, {model}", *cells, _cell(gained, ".1f")))
+            rows.append((f"{quantity}, {unit}, {CALLED[model]}", *cells, _cell(gained, ".1f")))
     return Table(("error of", "L2 norm", "RMS", "fit, %", "smaller by, %"), tuple(rows))
 
 
@@ -566,8 +566,8 @@ validate = Stage(
     "Model against log",
     """Hold the models against logs.
 
-    A log's commands are played to the original model of the source, to the improved one with nominal
-    parameters, and to that with the sections actuator and pump, from the estimator's state at its start.
+    A log's commands are played to a model without bending and creep, to the nominal one with both, and to
+    this rig's, with what known, actuator and pump in rig.yaml say, from the estimator's state at its start.
     Logs of pressures are played to an actuator of the kind pressure_arm, from the first readings alone.
     Exits 0 whatever comes of it.
     """,

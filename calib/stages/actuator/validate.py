@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from calib.core.stage import Files
 
 ORIGINAL, NOMINAL, IMPROVED = "original", "nominal", "improved"
+CALLED = {ORIGINAL: "without bending and creep", NOMINAL: "nominal", IMPROVED: "this rig's"}
+"""What a person reads."""
 _SECONDS = 2.0
 """Of a log that the estimator looks at for the start."""
 

@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.geometry import apply_homography, box_grid, in_picture
+from calib.core.result import Result
+from calib.core.rig import VERBS, Rig
 from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficients
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
@@ -29,9 +31,6 @@ from calib.stages.firmware.section import Envelope
 from calib.stages.imu.levelling import Levelling, settled
 from calib.stages.imu.levelling import gains as gains_of
 from calib.stages.lowpass.filters import Design, design_lowpass, state_variable_gains
-
-if TYPE_CHECKING:
-    from calib.core.rig import Rig
 
 # ----------------------------------------------------------------------
 # Values of rig.yaml by their keys, with the nominal actuator's where the file has none.
@@ -76,8 +75,18 @@ class Lookup:
         if not least <= value <= most:
             raise BadInputError(
                 f"{self.source}: {key} is {value:g}, expected {least:g} to {most:g} for the firmware"
+                + self.senseless(key)
             )
         return float(value)
+
+    def senseless(self, key: str) -> str:
+        """The end of a sentence about a number of a section whose data do not determine it; "" otherwise."""
+        name = key.split(".")[0]
+        section = getattr(self.rig, name)
+        word = section.verdict.word if isinstance(section, Result) else "ok"
+        if word in ("ok", "poor"):
+            return ""
+        return f"; {name} is {word}, so that its numbers mean nothing: run calib {VERBS[name]} on other data"
 
 
 # ----------------------------------------------------------------------
@@ -200,7 +209,7 @@ def _delay_ticks(lookup: Lookup, rate_hz: float) -> float:
     """Ticks from the exposure of a picture to the tick that reads it; 0 for pictures that seem early."""
     delay = lookup.number("align.time_offset_s", 0.0) * rate_hz
     if not -MOST_EARLY_TICKS <= delay <= MOST_DELAY_TICKS:
-        advice = (
+        advice = lookup.senseless("align.").removeprefix("; ") or (
             "take a faster camera, or tick more slowly: calib lowpass --rate "
             f"{max(math.floor(MOST_DELAY_TICKS * rate_hz / delay), 1)}Hz"
             if delay > 0.0
