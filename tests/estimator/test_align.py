@@ -142,7 +142,15 @@ def test_the_clocks_steps_are_in_the_offset() -> None:
     assert abs(tick.sensor[OFFSET] - 0.025) < 3 * tick.sigma[OFFSET]
     found = [one for one in judge(tick).findings if "the time offset" in one.text]
     assert found[0].severity == "poor" and "clock has steps" in found[0].text
-    assert "microseconds" in found[0].advice
+    assert "six decimals" in found[0].advice
+    (told,) = [
+        one.text
+        for one in judge(replace(tick, clock_s=0.0, shared=0.2)).findings
+        if "the time offset" in one.text
+    ]
+    assert "20 % of the time stamps are those of the reading before" in told
+    # The marker of a pendulum's end, whose tangent turns no further than its place.
+    assert any("pendulum" in one for one in judge(replace(tick, factor=1.9)).advice)
 
 
 def test_a_swing_between_readings_of_a_slow_imu_is_no_scale() -> None:

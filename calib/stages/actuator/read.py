@@ -297,7 +297,7 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path, rest: float) -> tuple[Hea
         raise BadInputError(
             f"{log.source}: {len(pictures)} pictures have {len(np.unique(pictures.t_s))} time stamps, "
             + (f"in steps of {1e3 * step:.3g} ms, " if step else "")
-            + "expected one for each; write t_s in microseconds, as each picture is taken"
+            + "expected one for each; write t_s with six decimals, as each picture is taken"
         )
     found_at = np.isfinite(seen[:, 0])
     t, heads, whitening = pictures.t_s[found_at], seen[found_at], np.empty((int(found_at.sum()), 2, 2))

@@ -1034,6 +1034,7 @@ class Alignment:
     correlation : (k,) of the camera's rate of angle with the gyroscope's at `OFFSETS_S`.
     left_out : sentences on gaps and logs that were not used.
     clock_s : by how much steps of the logs' clocks may move the offset.
+    shared : the largest share of a sensor's stamps in a stretch that are those of the reading before.
     pace, pace_sigma : by which share the camera's clock is faster than the IMU's.
     span_s : of the longest stretch. apart : logs in which a quantity is another one.
     aside_m : how far across the head the logs alone place the marker, with its deviation, where that is
@@ -1058,6 +1059,7 @@ class Alignment:
     pace_sigma: float = math.inf
     span_s: float = 0.0
     apart: tuple[Apart, ...] = ()
+    shared: float = 0.0
     aside_m: tuple[float, float] | None = None
 
     @property
@@ -1388,6 +1390,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         first.factor, checks, traces, correlation(pieces), tuple(said), clock_s,
         *_pace(pieces, float(fit.sensor[_OFFSET])),
         max(float(np.ptp(piece.camera.t_s)) for piece in pieces), tuple(apart),
+        max(axis.repeated / len(axis.stamps_s) for piece in pieces for axis in (piece.camera, piece.imu)),
     )  # fmt: skip
     return _centred(found, settings.aside_sigma_m) if settings.aside_sigma_m else found
 
@@ -1468,6 +1471,10 @@ _REPEATS = 0.25
 _REPEATS_PX = 0.1
 """Root mean square of what is beyond half a pixel from which on it says something."""
 _FACTOR, _NO_FACTOR = 0.2, 0.5
+_BENDS = (
+    "the head is taken for that of an actuator that bends with constant curvature, and turns twice as far as "
+    "its place; calib align is not for one on a stiff arm about a pin, such as a pendulum"
+)
 _BEYOND_PRIOR = 4.0
 _NOTHING_LEARNT = 0.8
 _INSEPARABLE = 0.98
@@ -1520,6 +1527,7 @@ def _data(found: Alignment) -> Iterator[Finding]:
         yield Finding(
             "unidentifiable" if abs(found.factor - 1.0) > _NO_FACTOR else "poor",
             f"the camera sees {found.factor:.2g} times the turn that the gyroscope feels",
+            _BENDS if found.factor > 1.0 else "",
         )
 
 
@@ -1601,6 +1609,11 @@ _MOVED = (
 )
 
 
+_STAMPS = "write t_s with six decimals, as each reading is taken"
+_SHARED = 0.05
+"""Of the stamps; those of a recorder that wrote one twice are fewer."""
+
+
 def _known(found: Alignment) -> Iterator[Finding]:
     sigma = found.sigma
     offset = float(sigma[_OFFSET])
@@ -1612,7 +1625,10 @@ def _known(found: Alignment) -> Iterator[Finding]:
         advice = _SWING
         if found.clock_s > 0.5 * offset:
             why = f": the logs' clock has steps, which alone make {1e3 * found.clock_s:.2g} ms of it"
-            advice = "write t_s in microseconds, as each reading is taken"
+            advice = _STAMPS
+        elif found.shared > _SHARED:
+            why = f": {100.0 * found.shared:.0f} % of the time stamps are those of the reading before"
+            advice = _STAMPS
         words = "is not observable, its deviation is" if offset > _OFFSET_S[1] else "has a deviation of"
         yield Finding(
             "unidentifiable" if offset > _OFFSET_S[1] else "poor",

@@ -122,7 +122,8 @@ align = Stage(
     """Find time offset, mount angle, scales and biases between camera and IMU from logs in motion.
 
     A free swing shows the time offset, slow motion to large angles all the rest. Writes the section align
-    of the rig's file. Exits 1 when the verdict is not ok.
+    of the rig's file. The head is that of an actuator that bends with constant curvature; a pendulum has
+    none. Exits 1 when the verdict is not ok.
     """,
     _read,
     _solve,

@@ -666,7 +666,7 @@ def coarse(log: OpenLog) -> Iterator[Finding]:
         yield Finding(
             "poor",
             f"t_s comes in steps of {1e3 * step:.3g} ms, each of which several readings share",
-            "write t_s in microseconds, as each reading is taken",
+            "write t_s with six decimals, as each reading is taken",
         )
 
 

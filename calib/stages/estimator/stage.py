@@ -131,7 +131,8 @@ replay = Stage(
     "States",
     """Estimate lengths, angle and pose from logs, with standard deviations and what they are worth.
 
-    Exits 1 when the innovations of a log contradict its covariance or a sensor is missing.
+    The head is that of an actuator that bends with constant curvature; a pendulum has none. Exits 1 when the
+    innovations of a log contradict its covariance or a sensor is missing.
     """,
     _read,
     _solve,

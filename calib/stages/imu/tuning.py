@@ -1251,6 +1251,9 @@ def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterato
             )
     if result.judge == "smoothed":
         yield Finding("remark", "Without a reference the logs are judged by their own smoothed angle.")
-    for log in logs:
-        if log.lag_s:
-            yield Finding("remark", f"{log.source}: {log.reference} came {1e3 * log.lag_s:.1f} ms late.")
+    for reference in dict.fromkeys(log.reference for log in logs if log.lag_s):
+        lags_ms = [1e3 * log.lag_s for log in logs if log.lag_s and log.reference == reference]
+        span = " to ".join(dict.fromkeys(f"{one:.0f}" for one in (min(lags_ms), max(lags_ms))))
+        better = "; calib align knows the delay" if reference == "camera" else ""
+        text = f"{reference} came {span} ms late by the best match of angles, log by log{better}."
+        yield Finding("remark", text)
