@@ -190,7 +190,7 @@ def _runs(result: PumpFound) -> plot.Figure:
         marks = [plot.Curve(t, record.value, "measured", "points", "grey", 2.5)]
         for model, fit in result.fits.items():
             simulated = fit.run(record)
-            marks.append(plot.Curve(t, simulated, CALLED[model], "line", _MODELS[model], 1.1))
+            marks.append(plot.Curve(t, simulated, model, "line", _MODELS[model], 1.1))
             off = held[model].get(record.name, rms(simulated - record.value))
             errors.append(f"{off:.2f}")
         title = f"{plot.short(record.name, 20)}: {' / '.join(errors)}"
