@@ -280,6 +280,18 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     return Picture(name, digest, gray, (width, height), count_pictures(data), second)
 
 
+def asks_to_turn(path: Path) -> bool:
+    """Whether a JPEG's EXIF orientation asks to turn or mirror it, which `read_picture` does not."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("JPEG",)) as image:
+            return image.getexif().get(0x112, 1) in range(2, 9)
+    except Exception:
+        # Of another kind, or damaged.
+        return False
+
+
 def is_heic(data: bytes) -> bool:
     """Whether these are the bytes of a HEIF picture that OpenCV does not decode."""
     return data[4:8] == b"ftyp" and b"avif" not in data[8:40]

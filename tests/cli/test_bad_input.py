@@ -134,6 +134,7 @@ def test_other_kinds_of_picture_show_the_same_board(calib, pictures, gray, tmp_p
     assert ended.code == 1
     assert "image_size_px: [316, 208]" in rig.read_text()
     assert "points: 35" in rig.read_text()
+    assert ("a.jpg: turning by EXIF is not done" in ended.err) == (kind == "exif")
 
 
 def test_a_picture_of_one_pixel_and_pictures_without_a_board(calib, pictures, noise, tmp_path) -> None:

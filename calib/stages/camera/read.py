@@ -20,9 +20,17 @@ from calib.core.errors import BadInputError, CalibError, UsageError
 from calib.core.files import PICTURES, check_readable, hash_of, one_line, read_yaml_mapping, shown, to_be
 from calib.core.schema import validated
 from calib.core.units import plain_number
+from calib.core.words import several
 from calib.core.workers import Workers
 from calib.io.frames import Frames, is_recording, read_frames
-from calib.io.pictures import Picture, holds_pictures, list_pictures, read_picture, usual_size
+from calib.io.pictures import (
+    Picture,
+    asks_to_turn,
+    holds_pictures,
+    list_pictures,
+    read_picture,
+    usual_size,
+)
 from calib.stages.camera import targets
 from calib.stages.camera.choice import most_informative
 from calib.stages.camera.corners import Detection, between_fields, detect, find_size
@@ -916,6 +924,10 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
     elif corners is None:
         remarks.append(f"found a board with {found.board.columns}x{found.board.rows} inner corners")
     remarks.append(f"board found in {len(found.views)} of {len(paths) + len(frames)} pictures")
+    if turned := [shown(path.name) for path in paths if asks_to_turn(path)]:
+        remarks.append(
+            f"{several(turned)}: turning by EXIF is not done; the camera is that of the sensor's own rows"
+        )
     views, hashes = found.views, {**found.hashes, **hashes}
     left_out = [*found.left_out, *_no_pictures(folders)]
     for one in recordings:

@@ -538,8 +538,8 @@ def _sentence(asked: Agreement, i: int, calibration: Calibration, others: int) -
     )
     if asked.chance[i] < _CHANCE:
         return (
-            f"shows another camera than the {others} views that agree (zoom, focus, rolling shutter or a "
-            f"bent board); {moved}"
+            f"shows another camera than the {others} views that agree (zoom, focus, a picture that a program "
+            f"turned, rolling shutter or a bent board); {moved}"
         )
     if asked.noise[i] > _ODD_NOISE:
         return (
