@@ -48,7 +48,7 @@ _VERBS = [
 _GROUPS = {
     "imu": "Understand an IMU: its bias, its noise, its drift.",
     "identify": "Identify the actuator from LOG..., a pump from tables, springs from weights; all with error "
-    "bars.",
+    "bars. calib identify LOG... is identify logs, or identify arm of logs with pressures.",
     "control": "Try controllers on the identified model before the hardware.",
 }
 _ELSEWHERE = {
@@ -70,6 +70,7 @@ def command_line(words: Sequence[str] = ()) -> typer.Typer:
     made = typer.Typer(
         name="calib",
         help="Calibrate a cheap camera and an IMU on a machine, down to the constants in its firmware.",
+        epilog="Begin with calib run -o demo, a simulated rig, or with calib docs tutorial.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,

@@ -152,7 +152,10 @@ def import_camera(
     rig: RigOption = Path("rig.yaml"),
     as_json: JsonOption = False,
 ) -> None:
-    """Read a camera from ROS camera_info, OpenCV FileStorage or Kalibr camchain, or an imu.yaml."""
+    """Read a camera from ROS camera_info, OpenCV FileStorage or Kalibr camchain, or an imu.yaml.
+
+    Writes the section camera of the rig's file, or imu.
+    """
     from calib.core.result import section_json
     from calib.core.rig import SECTIONS, Rig
 

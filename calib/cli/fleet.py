@@ -212,7 +212,9 @@ def _tell_fleet(summary: FleetSummary, as_before: int, output: Path) -> None:
 
 
 def sweep(
-    spec: Annotated[Path, typer.Argument(help="YAML with base, grid, draws and measure.")],
+    spec: Annotated[
+        Path, typer.Argument(help="YAML with base, grid, draws and measure; calib docs sweep shows one.")
+    ],
     output: OutOption,
     scheduler: SchedulerOption = None,
     workers: WorkersOption = None,

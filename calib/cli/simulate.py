@@ -45,7 +45,10 @@ def simulate(
     duration: Annotated[str | None, typer.Option(help="Length of the log, such as 10s.")] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Option of the scenario, such as Kp=500; may be repeated."),
+        typer.Option(
+            "--set",
+            help="Option of the scenario, such as Kp=500; may be repeated. calib docs simulate lists them.",
+        ),
     ] = None,
     rig: Annotated[
         Path | None, typer.Option("--rig", help="Rig to simulate; the nominal one by default.")

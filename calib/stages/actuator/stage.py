@@ -404,7 +404,7 @@ stiffness = Stage(
     _read_stiffness,
     _solve_stiffness,
     StiffnessOptions,
-    sources="Elongations with forces or masses.",
+    sources="Columns elongation_mm or _m with force_N, force_mN, mass_g or mass_kg.",
     several=False,
     metavar="TABLE",
     writes=("actuator",),

@@ -362,7 +362,7 @@ def _write_slower(files: Files, checked: Checked) -> list[Path]:
 check = Stage(
     "control check",
     "Reference checked",
-    """Whether the pumps can follow a reference, and the first second at which they cannot.
+    """Say whether the pumps can follow a reference, and the first second at which they cannot.
 
     Exits 1 when they cannot.
     """,

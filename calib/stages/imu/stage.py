@@ -204,8 +204,9 @@ tune = Stage(
     "Angle filter",
     """Tune angle filters on logs, judge them on parts they were not tuned on, and keep 3/3 unless one wins.
 
-    Uses the sections imu, camera and plane of the rig's file where they are, and writes its section
-    orientation_filter. Exits 1 when the logs do not allow a judgement.
+    3/3 are the gains Kp = 3/s and Ki = 3/s^2 of the Mahony-Madgwick filter. Uses the sections imu, camera
+    and plane of the rig's file where they are, and writes its section orientation_filter. Exits 1 when the
+    logs do not allow a judgement.
     """,
     _read_tune,
     later("calib.stages.imu.tuning", "solve_tune"),
@@ -277,7 +278,7 @@ def _drift_words(result: Drift) -> list[Block]:
 drift = Stage(
     "imu drift",
     "Drift of the angle",
-    """Compare how the angle drifts by the chip, the sensors alone, the MM filter and filters of others.
+    """Compare how the angle drifts by the chip, the sensors, the Mahony-Madgwick (MM) filter and others.
 
     Tuned gains are read from the rig's file, to which nothing is written.
     """,
