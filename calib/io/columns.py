@@ -661,6 +661,10 @@ def _together(cells: Mapping[str, FloatArray], columns: ColumnMap, names: Sequen
     return np.asarray(values[np.isfinite(values).all(axis=1)])
 
 
+_ALIKE, _SECONDS_S = 4.0, 0.5
+"""Rows that share a stamp, and what is between two stamps, from which on nothing tells when a reading was."""
+
+
 def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
     source = columns.sources["t_s"]
     sensors = [cells[name] for name in _of(columns, (*ACCEL, *GYRO))] or [
@@ -671,8 +675,18 @@ def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
     )
     steps = np.diff((cells["t_s"][rows]) * source.factor)
     steps = steps[steps > 0.0]
-    step = float(np.median(steps)) if len(steps) >= _FEWEST else math.nan
     units = UNITS["time"]
+    each, coarse_s = (
+        rows.sum() / (len(steps) + 1),
+        np.median(steps) * units.get(source.unit, 0.0) if len(steps) else 0.0,
+    )
+    if each >= _ALIKE and coarse_s >= _SECONDS_S:
+        raise BadInputError(
+            f"{columns.source}: {one_line(source.column)[:40]} comes in steps of {coarse_s:.3g} s, each of "
+            f"which {each:.0f} rows share, expected the time of each reading; write it with six decimals, as "
+            "each reading is taken"
+        )
+    step = float(np.median(steps)) if len(steps) >= _FEWEST else math.nan
     likely = [unit for unit, scale in units.items() if _RATES_HZ[0] <= 1.0 / (step * scale) < _RATES_HZ[1]]
     if source.unit:
         if source.stated == "file":

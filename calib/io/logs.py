@@ -640,15 +640,8 @@ class Signals:
         )  # fmt: skip
 
 
-_ALIKE, _SECONDS_S = 4.0, 0.5
-"""Rows that share a stamp, and what is between two stamps, from which on nothing tells when a reading was."""
-
-
 def check_time(log: Log) -> None:
-    """Raise `BadInputError` at the first row whose time is earlier than that of the row before.
-
-    Also for stamps in whole seconds, each of several rows.
-    """
+    """Raise `BadInputError` at the first row whose time is earlier than that of the row before."""
     back = np.nonzero(np.diff(log.t_s) < 0.0)[0]
     if len(back):
         i = int(back[0]) + 1
@@ -661,14 +654,6 @@ def check_time(log: Log) -> None:
         raise BadInputError(
             f"{log.source}, line {log.lines[i]}: t_s goes back from {log.t_s[i - 1]:.6f} "
             f"to {log.t_s[i]:.6f}, expected time to run forward; {advice}"
-        )
-    apart = np.diff(log.t_s, prepend=-np.inf)
-    stamps = log.t_s[apart > 0.0]
-    each, apart_s = len(log) / max(len(stamps), 1), np.median(np.diff(stamps)) if len(stamps) > 1 else 0.0
-    if each >= _ALIKE and apart_s >= _SECONDS_S:
-        raise BadInputError(
-            f"{log.source}: t_s comes in steps of {apart_s:.3g} s, each of which {each:.0f} rows share, "
-            "expected the time of each reading; write t_s with six decimals, as each reading is taken"
         )
 
 

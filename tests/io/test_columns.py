@@ -239,6 +239,13 @@ def test_what_the_readings_contradict_is_refused_with_what_to_do(
         read_log(path, LogOptions(**options))  # type: ignore[arg-type]
 
 
+def test_stamps_in_whole_seconds_tell_no_time(tmp_path: Path) -> None:
+    t, values = _imu()
+    path = _written(tmp_path / "log.csv", NAMED.split(), [t // 1.0, *values.T])
+    with pytest.raises(BadInputError, match=r"t_s comes in steps of 1 s, each of which 1?\d\d rows share"):
+        read_log(path)
+
+
 @pytest.mark.parametrize(("scale", "unit"), [(1e3, "mdeg/s"), (131.0, "")])
 @pytest.mark.parametrize("moving", [True, False])
 def test_millidegrees_are_read_where_the_turns_say_so(
