@@ -28,7 +28,17 @@ from calib.stages.arm.identify import (
     identify,
     mean_of,
 )
-from calib.stages.arm.model import PARAMETERS, Assembly, Trial, begun, segment_run, values_on
+from calib.stages.arm.model import (
+    NO_JUMP_KPA,
+    PARAMETERS,
+    STEP_S,
+    Assembly,
+    Trial,
+    begun,
+    drive_run,
+    segment_run,
+    values_on,
+)
 from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
 from calib.stages.arm.stage import _far
 
@@ -76,6 +86,29 @@ def test_a_part_that_is_off_plays_no_part() -> None:
     rest = off["rest_rad"] + 100.0 * off["bends_rad_per_kpa"] / (1.0 + 100.0 * off["stiffens_per_kpa"])
     expected = rest + (begun(one.angle_rad) - rest) * np.exp(-one.t_s / off["lag_s"])
     np.testing.assert_allclose(angle, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("jump_kpa", "drains_s", "fills_s"),
+    [(25.0, 40.0 / (1.2 * 125.0), 40.0 / (125.0 * 0.9)), (NO_JUMP_KPA, 40.0 / (1.2 * 100.0), 40.0 / 100.0)],
+)
+def test_a_pilot_crosses_the_overlap_in_its_time(jump_kpa: float, drains_s: float, fills_s: float) -> None:
+    """Of 20 kPa to either side, with an error of 100 kPa, at 1/s. At about the chamber's 120 kPa the pilot
+    fills at psi(.60) = .9 of its rate from a supply of 270 kPa; that of earlier files fills at any pressure.
+    """
+    tight = dict.fromkeys(("leak_per_s", "line_to_chamber", "input_s"), 1e-6) | {"overlap_kpa": 20.0}
+    pilot = {"pilot_per_s": 1.0, "pilot_drains": 1.2, "pilot_jump_kpa": jump_kpa, "supply_kpa": 270.0}
+    n = 60
+    trial = replace(simulated("a", 1), command=np.full(n, 20.0), pressure_kpa=np.full(n, 120.0))
+    fast = TRUE | tight | pilot | {"opening_kpa": 1.0}
+    # From where supply opens the pilot drains through the overlap before the exhaust opens.
+    falls = float(np.argmax(drive_run(trial, fast) < 119.0)) * STEP_S
+    assert falls == pytest.approx(drains_s, abs=0.03)
+    # Drained half-way, it fills as far again.
+    half = round(0.5 * drains_s / STEP_S)
+    up = replace(trial, command=np.where(np.arange(n) < half, 20.0, 220.0))
+    rises = float(np.argmax(drive_run(up, fast) > 121.0) - half) * STEP_S
+    assert rises == pytest.approx(0.5 * fills_s, abs=0.03)
 
 
 def test_a_load_bends_an_upright_arm_further() -> None:
@@ -134,6 +167,13 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
     assert old is not None
     assert old.parameters == fewer
     assert (old.values_on("a")["lengthens_s"], old.values_on("a")["lengthens_per_kpa"]) == (1.0, 0.0)
+    names = [name for name in ("valve", *small.parts) if name != "lag"]
+    plain = dict.fromkeys(set(Assembly(tuple(names)).names) - {"input_s", "pilot_jump_kpa"}, 2.0)
+    old = Rig.of(
+        {"schema": 2, "arm": section | {"verdict": "ok", "parts": names, "parameters": plain}}, "rig.yaml"
+    ).arm
+    assert old is not None
+    assert old.values_on("a")["pilot_jump_kpa"] == NO_JUMP_KPA
     with pytest.raises(BadInputError, match=r"expected factors of .*bends_rad_per_kpa, not of lag_s"):
         Rig.of({"arm": section | {"verdict": "ok", "days": {"a": {"lag_s": 1.1}}}}, "rig.yaml")
     with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):

@@ -1,12 +1,14 @@
 """A bending arm, assembled from parts that drive, bend and resist, and its free run.
 
-Valve: the pilot x [kPa] integrates the command u, smoothed by the input, against the outlet's pressure p, and
-drains D times as fast as it fills. Within the overlap d neither port is open; supply and exhaust open over w
-as x leaves it. The outlet's line feeds the chamber, p_c. Flows are those of nozzles (ISO 6358, critical ratio
-.3, absolute pressures, P_0 of the air):
+Valve: the pilot x [kPa] integrates the command u, smoothed by the input, against the outlet's pressure p. Its
+solenoids open for no less than an error j asks for. It fills from the supply, more slowly the fuller it is,
+and drains at D times the rate. Within the overlap d neither port is open; supply and exhaust open over w as x
+leaves it. The outlet's line feeds the chamber, p_c. Flows are those of nozzles (ISO 6358, critical ratio .3,
+absolute pressures, P_0 of the air):
 
     du/dt   = (command - u) / t_u
-    dx/dt   = r (u - p), D times that for u < p,  |x - p| <= d + w
+    dx/dt   = r (u - p + j) psi((x + P_0) / (p_s + P_0)) for u > p, D r (u - p - j) for u < p,
+              |x - p| <= d + w
     dp/dt   = S o(x - p) (p_s + P_0) psi((p + P_0) / (p_s + P_0)) - E o(p - x) (p + P_0) psi(P_0 / (p + P_0))
               - l p - k (p - p_c),   o(e) = max(e - d, 0) / w
     dp_c/dt = n k (p - p_c)
@@ -54,6 +56,8 @@ _BEGINS = 3
 """Steps whose median is the start of a free run."""
 _AIR_KPA = 101.3
 _CRITICAL = 0.3
+NO_JUMP_KPA = 1e-6
+"""Jump of a valve whose pilot has none and fills at any pressure, as in files of earlier versions."""
 _LEANS = 0.55
 
 
@@ -133,6 +137,9 @@ PARTS = (
         (
             Parameter("pilot_per_s", "1/s", 1.0, 0.5, True, identified_by=_STEPS),
             Parameter("pilot_drains", "", 1.0, 0.3, True, identified_by=_STEPS),
+            Parameter(
+                "pilot_jump_kpa", "kPa", 0.07, 0.5, True, _P, identified_by="small steps of the command"
+            ),
             Parameter("overlap_kpa", "kPa", 0.1, 0.6, True, _P, identified_by="commands that change sign"),
             Parameter("opening_kpa", "kPa", 0.03, 0.7, True, _P, identified_by="commands that change sign"),
             Parameter("supply_per_s", "1/s", 1.2, 0.4, True, identified_by="steps up"),
@@ -276,7 +283,7 @@ def _nozzle(ratio: float) -> float:
 
 @kernel()
 def _valve(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
-    rate, drains, overlap, opening, supply, exhaust, source, line, ratio, leak, input_s = q
+    rate, drains, jump, overlap, opening, supply, exhaust, source, line, ratio, leak, input_s = q
     out = np.empty(len(command))
     outlet = chamber = start_kpa
     ahead = overlap
@@ -289,7 +296,12 @@ def _valve(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
         for _ in range(_FINER):
             smooth += follows * (command[k] - smooth)
             error = smooth - outlet
-            ahead += step_s * rate * error * (drains if error < 0.0 else 1.0)
+            pilot = rate * (error + math.copysign(jump, error))
+            if error < 0.0:
+                pilot *= drains
+            elif jump > NO_JUMP_KPA:
+                pilot *= _nozzle((outlet + ahead + _AIR_KPA) / (source + _AIR_KPA))
+            ahead += step_s * pilot
             ahead = min(max(ahead, -overlap - opening), overlap + opening)
             # Implicit in the pressures, as ports and line are fast: flows over the drops that drive them.
             fills = empties = 0.0

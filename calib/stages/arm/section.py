@@ -7,10 +7,10 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
-from calib.stages.arm.model import DAILY, DRIVES, PARAMETERS, PARTS, Assembly, values_on
+from calib.stages.arm.model import DAILY, DRIVES, NO_JUMP_KPA, PARAMETERS, PARTS, Assembly, values_on
 
-_AT_ONCE_S = 1e-4
-"""Input of a valve in files of earlier versions, which knew none."""
+_PLAIN_VALVE = {"input_s": 1e-4, "pilot_jump_kpa": NO_JUMP_KPA}
+"""Parameters of a valve that files of earlier versions lack."""
 _AS_SETTLING = {"lengthens_s": "settling_s", "lengthens_per_kpa": "settling_per_kpa"}
 """Parameters that files of earlier versions lack: there the chord recovered as the angle settled."""
 
@@ -70,7 +70,7 @@ class Arm(Result):
         }
         out, parameters = section | {"days": days}, section.get("parameters")
         if isinstance(parameters, dict) and "leak_per_s" in parameters:
-            out["parameters"] = {"input_s": _AT_ONCE_S} | parameters
+            out["parameters"] = _PLAIN_VALVE | parameters
         return out
 
     @model_validator(mode="after")
