@@ -1668,7 +1668,7 @@ def _experiments(rest_length_m: float, tick_s: float) -> tuple[Experiment, ...]:
     off, straight = np.zeros((n, 2)), Start(0.0, rest_length_m)
     turn = 2.0 * np.pi * t / (0.5 * _DURATION_S)
     ellipse = 200.0 + 50.0 * np.stack([np.sin(turn), -np.sin(turn)], axis=1)
-    levels = np.array([[175.0, 175.0], [250.0, 250.0], [0.0, 0.0], [225.0, 0.0], [0.0, 0.0]])
+    levels = np.array([[225.0, 225.0], [0.0, 0.0], [225.0, 0.0], [225.0, 0.0], [0.0, 0.0]])
     steps = levels[np.minimum((5.0 * t / _DURATION_S).astype(int), 4)]
     deflate = np.where(t[:, None] < 0.6 * _DURATION_S, 250.0, off)
     return (
