@@ -17,7 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.command import one_command
-from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, SomeFailedError, end_of
+from calib.core.errors import (
+    EXIT_DONE,
+    EXIT_INTERNAL,
+    EXIT_POOR,
+    BadInputError,
+    SomeFailedError,
+    end_of,
+)
 from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
@@ -61,7 +68,14 @@ def _carried_out(
     of_data = made.writes_rig(options) and bool(made.sources) and not made.needs
     may_begin = of_data or (rig_path.name == RIG and rig_path.parent.is_dir())
     rig = Rig.load(rig_path, missing_ok=may_begin)
-    outcome = made.run(files, rig, options)
+    try:
+        outcome = made.run(files, rig, options)
+    except BadInputError as error:
+        lacks = str(error).startswith(f"{shown(rig_path)}: has no")
+        if lacks and rig_path.name != RIG and not rig_path.exists():
+            # The name was mistyped: it says which one is meant.
+            Rig.load(rig_path)
+        raise
     sections = made.sections(outcome)
     if sections:
         rig = rig.with_sections(sections)

@@ -114,6 +114,8 @@ def test_a_rig_without_camera_or_plane(calib: Run, logs: dict[str, Log], rig: Pa
     done = calib("align", path, "--rig", bare)
     assert done.code == 3
     assert "run calib extrinsics first" in done.sentence
+    done = calib("identify", path, "--rig", tmp_path / "baer.yaml")
+    assert done.code == 3 and "there is no such file; did you mean bare.yaml?" in done.sentence
 
 
 def _times(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
