@@ -113,7 +113,7 @@ _ANSWER_S = 12.0
 """A usual board restarts when its port is opened, and computes its self-test."""
 
 _RUN_S = 5.0
-_MOST_PWM = 250
+MOST_PWM = 250
 """Below the greatest command, which the board allows for a few seconds only."""
 
 _PULLED_RAD = (math.radians(12.0), math.radians(50.0))
@@ -237,7 +237,7 @@ def _recorded(
 ) -> Done:
     rows, imu, markers, overruns = serial.Rows(), 0, 0, 0
     first_overruns: int | None = None
-    top = level * min(board.hello.open_high, _MOST_PWM)
+    top = level * min(board.hello.open_high, MOST_PWM)
     damaged, heard_s = board.decoder.damaged, board.port.now_s()
     queue, came = deque(before), board.messages()
     try:

@@ -1635,7 +1635,6 @@ def fit_stiffness(name: str, elongation_m: FloatArray, force_N: FloatArray) -> t
 # offsets eliminated. That of an experiment that was not done yet is that of a simulated one on the
 # identified rig, with a picture at each tick and the noise of the logs at hand.
 
-_DURATION_S = 8.0
 _TYPICAL = (0.004, 0.0004)
 
 
@@ -1661,23 +1660,17 @@ class Prospect:
     worst_relative: float
 
 
-def _experiments(rest_length_m: float, tick_s: float) -> tuple[Experiment, ...]:
-    """Eight seconds of what `calib record --do` has a rig do, by its names there."""
-    n = round(_DURATION_S / tick_s)
-    t = tick_s * np.arange(n, dtype=np.float64)
-    off, straight = np.zeros((n, 2)), Start(0.0, rest_length_m)
-    turn = 2.0 * np.pi * t / (0.5 * _DURATION_S)
-    ellipse = 200.0 + 50.0 * np.stack([np.sin(turn), -np.sin(turn)], axis=1)
-    levels = np.array([[225.0, 225.0], [0.0, 0.0], [225.0, 0.0], [225.0, 0.0], [0.0, 0.0]])
-    steps = levels[np.minimum((5.0 * t / _DURATION_S).astype(int), 4)]
-    deflate = np.where(t[:, None] < 0.6 * _DURATION_S, 250.0, off)
-    return (
-        Experiment("static", "rest, pumps off", straight, True, off),
-        Experiment("swing", "released from 0.5 rad, hoses off", Start(0.5, rest_length_m), False, off),
-        Experiment("steps", "pumps on and off, both and each alone", straight, True, steps),
-        Experiment("ellipse", "slowly to both sides", straight, True, ellipse),
-        Experiment("deflate", "both pumps on, then off", straight, True, deflate),
-    )
+def _experiments(rest_length_m: float, tick_s: float) -> Iterator[Experiment]:
+    """What `calib record --do` has a rig do, by its names there."""
+    from calib.io.experiments import EXPERIMENTS, MOST_PWM
+
+    for name, one in EXPERIMENTS.items():
+        t = tick_s * np.arange(round(one.seconds / tick_s))
+        shares = (
+            np.zeros((len(t), 2)) if one.command is None else np.array(list(map(one.command, t.tolist())))
+        )
+        start = Start(0.5 if one.by_hand else 0.0, rest_length_m)
+        yield Experiment(name, f"{one.seconds:g} s, {one.asks}", start, not one.by_hand, MOST_PWM * shares)
 
 
 def _information(

@@ -101,7 +101,7 @@ def _residuals(result: Identified) -> plot.Figure:
 def _parameters(result: Identified) -> plot.Figure:
     """Relative deviation of each parameter now and after one more experiment."""
     names = list(result.solution.problem.names)
-    note = "Bars are the standard deviation over the value from these logs, points with 8 s of one more test."
+    note = "Bars are the standard deviation over the value from these logs, points with one more recording."
     sigma, values = result.uncertainty.sigma, result.solution.values
     now = np.array([100.0 * sigma[name] / max(abs(values[name]), 1e-12) for name in names])
     marks: list[plot.Mark] = [plot.Bars(np.arange(len(names)), now, 0.6, "ice", across=True)]
