@@ -106,7 +106,8 @@ def test_signs_that_are_turned_in_the_logs_are_told_to_the_board(
 
 def test_a_rig_without_camera_or_plane(calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path) -> None:
     path = _put(tmp_path, "swing", logs["swing"])
-    done = calib("align", path, "--rig", tmp_path / "rig.yaml")
+    (tmp_path / "new").mkdir()
+    done = calib("align", path, cwd=tmp_path / "new")
     assert done.code == 3
     assert "run calib intrinsics first" in done.sentence
     bare = tmp_path / "bare.yaml"
