@@ -1471,9 +1471,9 @@ _REPEATS = 0.25
 _REPEATS_PX = 0.1
 """Root mean square of what is beyond half a pixel from which on it says something."""
 _FACTOR, _NO_FACTOR = 0.2, 0.5
-_BENDS = (
-    "the head is taken for that of an actuator that bends with constant curvature, and turns twice as far as "
-    "its place; calib align is not for one on a stiff arm about a pin, such as a pendulum"
+_TURNS = (
+    "check the gyroscope's unit and axis, and the squares' length; calib align is not for a head on a stiff "
+    "arm about a pin, such as a pendulum, which turns half as far as one that bends"
 )
 _BEYOND_PRIOR = 4.0
 _NOTHING_LEARNT = 0.8
@@ -1527,7 +1527,7 @@ def _data(found: Alignment) -> Iterator[Finding]:
         yield Finding(
             "unidentifiable" if abs(found.factor - 1.0) > _NO_FACTOR else "poor",
             f"the camera sees {found.factor:.2g} times the turn that the gyroscope feels",
-            _BENDS if found.factor > 1.0 else "",
+            _TURNS,
         )
 
 
