@@ -13,7 +13,7 @@ from sets import SIZES, SPOILS, Recipe, camera_of, sheared, take
 from calib.core.arrays import FloatArray, GrayImage
 from calib.io.pictures import list_pictures, read_picture, usual_size
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px, refitted
-from calib.stages.camera.checks import drift, evidence, overdispersion
+from calib.stages.camera.checks import alone_px, drift, evidence, overdispersion
 from calib.stages.camera.corners import detect
 from calib.stages.camera.intrinsics import Intrinsics, calibrate_camera
 from calib.stages.camera.model import Board, Camera, View, pack
@@ -215,6 +215,17 @@ def test_beside_a_bad_view_no_other_looks_turned(kind: str) -> None:
         bad = replace(views[0], name="bad", pixels=SPOILS[kind](views[0], camera, rng))
         found = turned_views(calibrate(pack([bad, *views[1:]]), SIZE, "radial2"))
         assert {one.name for one in found} <= {"bad"}
+
+
+def test_one_bad_view_is_no_change_of_all() -> None:
+    for seed in range(3):
+        rng, camera = np.random.default_rng(seed), camera_of()
+        views = take(rng, camera, 12, recipe=Recipe(0.03))
+        views[0] = replace(views[0], pixels=sheared(views[0], camera, rng))
+        fit = calibrate(pack(views), SIZE, "radial2")
+        alone, together = alone_px(fit)
+        assert fit.sigma_px > 1.5 * alone
+        assert together < 1.25 * alone
 
 
 def test_two_covered_corners_leave_without_their_view() -> None:

@@ -447,10 +447,11 @@ _TOLD = 1e-3
 """What a view tells of a direction, over what all views do, below which it is silent there."""
 
 
-def alone_px(calibration: bundle.Calibration) -> float:
-    """Standard deviation of a coordinate if every view had a camera of its own, its skew included.
+def alone_px(calibration: bundle.Calibration) -> tuple[float, float]:
+    """Standard deviations of a coordinate: if every view had a camera of its own, with a skew, and as it is.
 
-    One step of each view's parameters, in the directions of which it tells anything.
+    Of all views but the one that would gain most, as one bad view is no change in the others. One step of
+    each view's parameters, in the directions of which it tells anything.
     """
     free = np.union1d(calibration.free, [model.INTRINSICS.index("skew_px")])
     found = evidence(replace(calibration, free=free))
@@ -459,9 +460,14 @@ def alone_px(calibration: bundle.Calibration) -> float:
     told, Q = np.linalg.eigh(root.T @ found.S @ root)
     y2 = np.einsum("ngk,ng->nk", root @ Q, found.b) ** 2
     counts = told > _TOLD
-    fall = float((y2[counts] / told[counts]).sum())
-    freedom = int(found.measured.sum()) - 6 * len(found.b) - int(counts.sum())
-    return math.sqrt(max(float(found.cost.sum()) - fall, 0.0) / max(freedom, 1))
+    fall = np.divide(y2, told, out=np.zeros_like(y2), where=counts).sum(axis=1)
+    others = np.arange(len(fall)) != np.argmax(fall)
+    measured, cost = int((found.measured - 6)[others].sum()), found.cost[others]
+
+    def deviation(squares: FloatArray, unknowns: int) -> float:
+        return math.sqrt(max(float(squares.sum()), 0.0) / max(measured - unknowns, 1))
+
+    return deviation(cost - fall[others], int(counts[others].sum())), deviation(cost, len(calibration.free))
 
 
 # ----------------------------------------------------------------------

@@ -650,8 +650,10 @@ def _alone_odd(found: Triage) -> bool:
 
     Where those few differ by much, views that agree may seem to share a second camera with them.
     """
-    views, rest = sum(one.kind == "view" for one in found.left_out), found.calibration
-    return views <= _FEW_ODD and rest.sigma_px < Limits.change_times * checks.alone_px(_on_its_board(rest))
+    if sum(one.kind == "view" for one in found.left_out) > _FEW_ODD:
+        return False
+    alone, together = checks.alone_px(_on_its_board(found.calibration))
+    return together < Limits.change_times * alone
 
 
 def _moved_px(found: Triage) -> float:

@@ -16,6 +16,7 @@ on an even sample of 100.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -575,10 +576,9 @@ def _repeated(calibration: bundle.Calibration) -> float:
 
 def _of_change(fit: bundle.Calibration) -> Iterator[Finding]:
     """One camera and one board in all views, not another in each."""
-    alone = float(np.sqrt(2)) * checks.alone_px(fit)
-    change = float(np.sqrt(max(2 * fit.sigma_px**2 - alone**2, 0.0)))
+    alone, together = (math.sqrt(2.0) * one for one in checks.alone_px(fit))
+    change = math.sqrt(max(together**2 - alone**2, 0.0))
     scale = scale_of(fit.camera.image_size_px)
-    together = float(np.hypot(alone, change))
     if together < Limits.change_times * alone or change < Limits.change_remark_px * scale:
         return
     most = scale * (
