@@ -125,7 +125,14 @@ def test_a_soft_arms_compliance_is_found_from_one_loaded_trial() -> None:
 
 
 def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -> None:
-    assert half_width([1.0, 1.0, 1.0]) == pytest.approx(1.96, abs=0.01)
+    rng = np.random.default_rng(0)
+    trials = rng.normal(size=(4000, 4, 2))
+    inside = [
+        np.abs(one[-1] @ [[1.0, 1.0], [1.0, -1.0]]) <= half_width(np.hypot(*one[:-1].T).tolist())
+        for one in trials
+    ]
+    # Three trials, each with an offset and a gain of its own, tell what a fourth does.
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
     assert half_width([0.1, 0.1, 3.0]) > 3.0 * math.sqrt(3.0)
     assert math.isnan(half_width([1.0]))
 

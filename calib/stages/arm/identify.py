@@ -384,14 +384,15 @@ def half_width(errors: Sequence[float]) -> float:
     """Half the 95 % interval of a further trial's samples, from the RMS errors of held trials.
 
     Degrees of freedom by how much the mean squares differ from trial to trial (Satterthwaite 1946): trials
-    that are all alike tell their deviation, a single bad one among good ones makes it uncertain.
+    that are all alike tell their deviation, a single bad one among good ones makes it uncertain. At most two
+    a trial, its offset and its gain: a few trials may be alike by chance.
     """
     squares = np.array([x * x for x in errors if math.isfinite(x)])
     if len(squares) < 2:
         return math.nan
     mean = float(squares.mean())
     freedom = len(squares) * 2.0 * mean**2 / max(float(squares.var(ddof=1)), 1e-9 * mean**2)
-    return float(stdtrit(max(freedom, 1.0), 0.975)) * math.sqrt(mean)
+    return float(stdtrit(min(max(freedom, 1.0), 2.0 * len(squares)), 0.975)) * math.sqrt(mean)
 
 
 _FINER = (3.0, 10.0)
