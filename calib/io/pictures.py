@@ -336,6 +336,10 @@ def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
         return decoded, heard.read(10_000).decode("utf-8", "replace")
 
 
+_NEAR = np.ones((5, 5), dtype=np.uint8)
+_NEAR[2, 2] = 0
+
+
 def eight_bits(decoded: AnyArray) -> GrayImage:
     """Grey values of any depth as 8 bits, the brightest 0.1 % white; of a raw picture without its mosaic."""
     if decoded.dtype == np.uint8:
@@ -345,7 +349,8 @@ def eight_bits(decoded: AnyArray) -> GrayImage:
     if not finite.all():
         values = np.where(finite, values, np.float32(0.0))
     low = min(float(values.min()), 0.0)
-    white = float(np.percentile(values, 99.9))
+    # A hot pixel is brighter than all near it, those of its own colour in a mosaic among them.
+    white = float(np.percentile(np.minimum(values, cv2.dilate(values, _NEAR)), 99.9))
     if not 1e-12 < white - low < 1e30:
         return np.zeros(values.shape, dtype=np.uint8)
     values -= np.float32(low)

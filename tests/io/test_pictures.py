@@ -51,6 +51,10 @@ def test_depths_and_channels_become_grey(tmp_path: Path) -> None:
     assert gray.dtype == np.uint8
     white = np.percentile(GRAY, 99.9)
     assert np.abs(gray.astype(int) - np.clip(GRAY * (255 / white), 0, 255)).max() <= 1
+    hot = np.random.default_rng(0).random(deep.shape) < 0.002
+    (tmp_path / "hot.png").write_bytes(_png(np.where(hot, np.uint16(65535), deep)))
+    spotted = read_picture(tmp_path / "hot.png").gray[~hot].astype(int)
+    assert np.abs(spotted - gray[~hot]).max() <= 0.05 * 255
     np.testing.assert_array_equal(read_picture(tmp_path / "alpha.png").gray, GRAY)
     np.testing.assert_array_equal(read_picture(tmp_path / "colour.png").gray, GRAY)
     assert read_picture(tmp_path / "tiny.png").size_px == (1, 1)
