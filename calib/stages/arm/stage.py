@@ -157,7 +157,7 @@ def _solve(
 def judge(found: Identification) -> Iterator[Finding]:
     """What the held trials, the baselines and the posterior say of an identification."""
     from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
-    from calib.stages.arm.model import begun
+    from calib.stages.arm.model import DAILY, begun
 
     if not any(len(one.angle_rad) for one in found.trials):
         yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
@@ -191,6 +191,14 @@ def judge(found: Identification) -> Iterator[Finding]:
         )
     yield from _far(found)
     yield from _untold(found)
+    if len({one.day for one in found.trials}) == 1:
+        share = DAILY["bends_rad_per_kpa"]
+        yield Finding(
+            "remark",
+            f"all trials are of one day: on another the angle may well differ by {100.0 * share:.0f} %, "
+            f"{math.degrees(share * size):.0f} deg at the most, which the interval of a trial does not hold",
+            "record trials on another day, too, and state it with --day where names do not tell",
+        )
     values = found.fit.values
     if values.get("compliance_rad_per_Nm", 0.0) < 0.0:
         yield Finding(
@@ -319,6 +327,7 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
     """Trials to hold an arm against, in its plane. Raises `BadInputError` as `read_trials`."""
     import numpy as np
 
+    from calib.stages.arm.model import DAILY
     from calib.stages.arm.read import Frame
 
     axis = arm.bending_axis
@@ -331,7 +340,8 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
     trials, _, findings = read_trials(files, options, frame)
     files.remarks += [one.text for one in findings]
     files.remarks += [
-        f"{one.name}: day {one.day} is not in the rig, its factors are the means"
+        f"{one.name}: day {one.day} is not in the rig, its factors are the means; the angle may well be off "
+        f"by {100.0 * DAILY['bends_rad_per_kpa']:.0f} %"
         for one in trials
         if one.day not in arm.days
     ]
