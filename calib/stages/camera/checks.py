@@ -619,15 +619,20 @@ def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
     as described moves the camera by as much as it would if the board's shape were estimated too, and one that
     changes from view to view is another by as much.
     """
-    moved: list[FloatArray] = []
     try:
         inflation = overdispersion(evidence(calibration, calibration.basis))
-        if calibration.basis is None and calibration.observations.views >= _TELL_SHAPE:
-            shape, ran = certain_shape(calibration), drift(calibration)
-            moved = [one for one in (None if shape is None else shape.shift, ran) if one is not None]
+        tells = calibration.basis is None and calibration.observations.views >= _TELL_SHAPE
+        shape, ran = (certain_shape(calibration), drift(calibration)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
-        inflation = 1.0
-    return bundle.covariance(calibration, (inflation * calibration.sigma_px) ** 2, moved)
+        inflation, shape, ran = 1.0, None, None
+    variance = (inflation * calibration.sigma_px) ** 2
+    known = bundle.covariance(calibration, variance, [] if shape is None else [shape.shift])
+    if ran is None:
+        return known
+    # What changes is the camera: it may be turned for that, but no pose is nearer than it was.
+    moved = np.concatenate([ran, turn_for(calibration, ran)[0], np.zeros(3)])
+    whole = known.intrinsics + np.outer(ran, ran), known.joint + np.outer(moved, moved)
+    return replace(known, intrinsics=whole[0], joint=whole[1])
 
 
 # ----------------------------------------------------------------------
@@ -974,14 +979,19 @@ def _described(
     )
 
 
-def apart_px(calibration: bundle.Calibration, difference: FloatArray) -> float:
-    """Root mean square change of the pixels seen by a change of the free intrinsics, and the best turn."""
+def turn_for(calibration: bundle.Calibration, difference: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The turn (3,) [rad] that undoes most of a change of the free intrinsics, and the pixels left (2 n,)."""
     used = points_C(calibration)
     J = bundle.joint_jacobian(calibration, used[:: max(1, len(used) // 500)])
     P = len(difference)
     moved, turned = (J[..., :P] @ difference).ravel(), J[..., P : P + 3].reshape(-1, 3)
-    left = moved - turned @ np.linalg.lstsq(turned, moved, rcond=None)[0]
-    return float(np.sqrt(2 * np.mean(left**2)))
+    turn = -np.linalg.lstsq(turned, moved, rcond=None)[0]
+    return np.asarray(turn, dtype=np.float64), np.asarray(moved + turned @ turn, dtype=np.float64)
+
+
+def apart_px(calibration: bundle.Calibration, difference: FloatArray) -> float:
+    """Root mean square change of the pixels seen by a change of the free intrinsics, and the best turn."""
+    return float(np.sqrt(2 * np.mean(turn_for(calibration, difference)[1] ** 2)))
 
 
 def _without(problem: _Problem, odd: IntArray) -> _Problem:
