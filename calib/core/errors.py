@@ -52,6 +52,10 @@ class BadInputError(CalibError):
     """Something that was read is not what it has to be; the message names file, line or key."""
 
 
+class NoSectionError(BadInputError):
+    """The rig's file lacks a section that is needed."""
+
+
 class UsageError(CalibError):
     """The words of the command line do not fit together."""
 

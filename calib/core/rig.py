@@ -25,7 +25,7 @@ import yaml
 from pydantic import BaseModel, Field, field_validator
 
 from calib.core import __version__
-from calib.core.errors import BadInputError
+from calib.core.errors import BadInputError, NoSectionError
 from calib.core.files import one_line, quoted, read_yaml_mapping, sha256, shown
 from calib.core.result import Result, Section, identity, section_json
 from calib.core.schema import nearest, validated
@@ -416,7 +416,7 @@ class Rig:
         """A section. Raises `BadInputError`, which says the verb that makes it, where there is none."""
         section = getattr(self, name)
         if section is None:
-            raise BadInputError(f"{shown(source)}: has no {name} yet{why}; run calib {VERBS[name]} first")
+            raise NoSectionError(f"{shown(source)}: has no {name} yet{why}; run calib {VERBS[name]} first")
         return section
 
     def current_plane(self, source: Path | str) -> Plane | None:

@@ -676,10 +676,8 @@ def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
     steps = np.diff((cells["t_s"][rows]) * source.factor)
     steps = steps[steps > 0.0]
     units = UNITS["time"]
-    each, coarse_s = (
-        rows.sum() / (len(steps) + 1),
-        np.median(steps) * units.get(source.unit, 0.0) if len(steps) else 0.0,
-    )
+    each = rows.sum() / (len(steps) + 1)
+    coarse_s = np.median(steps) * units.get(source.unit, 0.0) if len(steps) else 0.0
     if each >= _ALIKE and coarse_s >= _SECONDS_S:
         raise BadInputError(
             f"{columns.source}: {one_line(source.column)[:40]} comes in steps of {coarse_s:.3g} s, each of "

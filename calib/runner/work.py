@@ -21,7 +21,7 @@ from calib.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
     EXIT_POOR,
-    BadInputError,
+    NoSectionError,
     SomeFailedError,
     end_of,
 )
@@ -70,10 +70,9 @@ def _carried_out(
     rig = Rig.load(rig_path, missing_ok=may_begin)
     try:
         outcome = made.run(files, rig, options)
-    except BadInputError as error:
-        lacks = str(error).startswith(f"{shown(rig_path)}: has no")
-        if lacks and rig_path.name != RIG and not rig_path.exists():
-            # The name was mistyped: it says which one is meant.
+    except NoSectionError:
+        if rig_path.name != RIG:
+            # A name that was mistyped says which one is meant.
             Rig.load(rig_path)
         raise
     sections = made.sections(outcome)

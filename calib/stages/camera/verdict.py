@@ -247,12 +247,12 @@ def _of_richer(fit: bundle.Calibration, wide: bundle.Calibration) -> Iterator[Fi
         yield Finding("poor" if serious else "remark", text, "Use a richer lens model.")
 
 
-def _of_projection(fit: bundle.Calibration) -> Iterator[Finding]:
+def _of_projection(fit: bundle.Calibration, known: bundle.Covariance) -> Iterator[Finding]:
     """Standard deviation of projection where points were seen."""
     outline = checks.hull(fit.observations.pixels[fit.observations.present])
     grid = box_grid([*outline.min(axis=0), *outline.max(axis=0)], 14, 12).reshape(-1, 2)
     inside = grid[checks.inside_hull(grid, outline)]
-    spread = bundle.projection_sigma_px(fit, checks.by_the_views(fit), inside)
+    spread = bundle.projection_sigma_px(fit, known, inside)
     bounded = spread[~np.isnan(spread)]
     sigma_px = float(np.median(bounded)) if len(bounded) else np.inf
     limit = Limits.projection_share * max(fit.camera.image_size_px)
@@ -267,14 +267,16 @@ def _of_projection(fit: bundle.Calibration) -> Iterator[Finding]:
         yield Finding("poor", text, "Take more pictures, with the board tilted and close.")
 
 
-def _of_border(fit: bundle.Calibration, sturdy: bundle.Calibration) -> Iterator[Finding]:
+def _of_border(
+    fit: bundle.Calibration, sturdy: bundle.Calibration, known_sturdy: bundle.Covariance
+) -> Iterator[Finding]:
     """Standard deviation of projection at the points of the border that the lens can show.
 
     The denominator of the rational model counts, unless nothing bounds it.
     """
-    known = checks.by_the_views(fit)
+    known = known_sturdy if fit is sturdy else checks.by_the_views(fit)
     if not np.all(np.isfinite(known.joint)):
-        fit, known = sturdy, checks.by_the_views(sturdy)
+        fit, known = sturdy, known_sturdy
     sigma_px = bundle.projection_sigma_px(fit, known, checks.image_outline(fit.camera))
     sigma_px = sigma_px[~np.isnan(sigma_px)]
     limit = Limits.border_share * max(fit.camera.image_size_px)
@@ -759,7 +761,8 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
-    findings += _of_projection(sturdy)
+    known = checks.by_the_views(sturdy)
+    findings += _of_projection(sturdy, known)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = checks.widened(some)
     shape = checks.target_shape(wide)
@@ -769,7 +772,7 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     findings += [
         *_of_split(checks.best_split(wide), wide),
         *_of_change(wide),
-        *_of_border(fit, sturdy),
+        *_of_border(fit, sturdy, known),
         *_of_lens(fit),
     ]
     return findings, sturdy

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, rms, runs
-from calib.core.errors import BadInputError
+from calib.core.errors import BadInputError, NoSectionError
 from calib.core.files import shown
 from calib.core.options import LogOptions
 from calib.core.result import CovarianceTable
@@ -467,9 +467,9 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
     elif found.camera:
         plane = rig.current_plane(str(path))
         if rig.camera is None:
-            raise BadInputError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
+            raise NoSectionError(f"{source}: has no camera, which pictures need; run calib intrinsics first")
         if plane is None:
-            raise BadInputError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
+            raise NoSectionError(f"{source}: has no plane, which pictures need; run calib extrinsics first")
         R, t = np.array(plane.R_CW), np.array(plane.t_CW_m)
         view = view_coefficients(rig.camera.optics, R, t, rig.middle_m)
     values, covariance, assumed = _from_align(rig)

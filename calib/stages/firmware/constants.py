@@ -6,6 +6,7 @@ Their names, units and comments are the template's, `templates/calib_constants.h
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -75,18 +76,15 @@ class Lookup:
         if not least <= value <= most:
             raise BadInputError(
                 f"{self.source}: {key} is {value:g}, expected {least:g} to {most:g} for the firmware"
-                + self.senseless(key)
+                + "".join(f"; {why}" for why in self.senseless(key.split(".")[0]))
             )
         return float(value)
 
-    def senseless(self, key: str) -> str:
-        """The end of a sentence about a number of a section whose data do not determine it; "" otherwise."""
-        name = key.split(".")[0]
+    def senseless(self, name: str) -> Iterator[str]:
+        """What is to be said of a section's number where its data do not determine it."""
         section = getattr(self.rig, name)
-        word = section.verdict.word if isinstance(section, Result) else "ok"
-        if word in ("ok", "poor"):
-            return ""
-        return f"; {name} is {word}, so that its numbers mean nothing: run calib {VERBS[name]} on other data"
+        if isinstance(section, Result) and (word := section.verdict.word) not in ("ok", "poor"):
+            yield f"{name} is {word}, so that its numbers mean nothing: run calib {VERBS[name]} on other data"
 
 
 # ----------------------------------------------------------------------
@@ -209,7 +207,7 @@ def _delay_ticks(lookup: Lookup, rate_hz: float) -> float:
     """Ticks from the exposure of a picture to the tick that reads it; 0 for pictures that seem early."""
     delay = lookup.number("align.time_offset_s", 0.0) * rate_hz
     if not -MOST_EARLY_TICKS <= delay <= MOST_DELAY_TICKS:
-        advice = lookup.senseless("align.").removeprefix("; ") or (
+        advice = next(lookup.senseless("align"), None) or (
             "take a faster camera, or tick more slowly: calib lowpass --rate "
             f"{max(math.floor(MOST_DELAY_TICKS * rate_hz / delay), 1)}Hz"
             if delay > 0.0
