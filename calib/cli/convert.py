@@ -85,7 +85,7 @@ def convert(
     }
     sentence = f"{rows} rows written to {shown(output)}: t_s, {', '.join(names)}"
     answer(as_json, "convert", {"convert": told}, sentence)
-    if first.unknown:
+    if first.unknown and not (read_as and read_as.unknown):
         narrate(f"left out: {', '.join(first.unknown)}")
     for sentence in passed.sentences:
         narrate(sentence)

@@ -29,6 +29,7 @@ import difflib
 import json
 import math
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +42,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.options import LogOptions
 from calib.core.units import GRAVITY_MPS2
+from calib.core.words import several
 from calib.core.writing import Kind, head
 
 MEASURED = (
@@ -114,11 +116,20 @@ _SPELLED = {
 }  # fmt: skip
 _UNIT = {word: unit for unit, words in _SPELLED.items() for word in words.split()}
 
-_ACCEL = r"(?P<accel>a|ac|acc|accl|accel|accelerometer|(?:total|linear)?acceleration|specificforce)"
-_GYRO = r"(?P<gyro>g|gy|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate)"
+_ACCEL = (
+    r"(?P<accel>a|ac|acc|accl|accel|accelerometer|(?:total|linear)?acceleration|specificforce"
+    r"|beschleunigung|aceleracion|accelerazione)"
+)
+_GYRO = (
+    r"(?P<gyro>g|gy|gyr|gyro|gyroscope|w|omega|angularvelocity|angularrate"
+    r"|gyroskop|drehrate|winkelgeschwindigkeit|vitesseangulaire|giroscopio|velocidadangular|velocitaangolare)"
+)
 _AXIS = re.compile(rf"(?:{_ACCEL}|{_GYRO})(?:rss)?(?P<axis>[xyz])")
 _AXIS_FIRST = re.compile(r"(?P<axis>[xyz])(?:(?P<accel>accl?|accel)|gyro)")
-_TIME = re.compile(r"t|ts|time|timeboot|datetime|timestamp|timestamps|stamp|clock|elapsed|headerstamp")
+_TIME = re.compile(
+    r"t|ts|time|timeboot|datetime|timestamp|timestamps|stamp|clock|elapsed|headerstamp"
+    r"|zeit|zeitstempel|uhrzeit|temps|horodatage|tiempo|hora|tempo|ora"
+)
 _NAMED_BY_UNIT = {
     "millis": "ms", "micros": "us", "nanos": "ns", "ms": "ms",
     "seconds": "s", "secs": "s", "secondselapsed": "s",
@@ -205,7 +216,8 @@ def known_name(name: str) -> tuple[str, str] | None:
         if not unit:
             return None
         name = bracket[1]
-    words = re.findall(r"[a-zµμ°%]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower())
+    plain = re.sub("[\u0300-\u036f]", "", unicodedata.normalize("NFD", name))
+    words = re.findall(r"[a-zµμ°%]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", plain).lower())
     while len(words) > 1 and (words[0] in _DEVICES or "".join(words[:2]) in _DEVICES):
         words = words[1 if words[0] in _DEVICES else 2 :]
     if not unit:
@@ -479,7 +491,7 @@ class ColumnMap:
 
     @property
     def narration(self) -> str:
-        """A sentence on columns that are not what their names say by themselves; empty for none."""
+        """A sentence on columns that are not read, or are not what their names say; empty for none."""
         words = {"time": "time", "accel": "accelerations", "gyro": "rates", "angle": "the chip's angle"}
         groups: dict[tuple[str, str], list[str]] = {}
         for column, source in self.sources.items():
@@ -497,7 +509,10 @@ class ColumnMap:
         for (kind, what), columns in groups.items():
             why = f" ({self.evidence[kind]})" if kind in self.evidence else ""
             parts.append(f"{what} from {', '.join(f'`{one_line(name)[:40]}`' for name in columns)}{why}")
-        return f"{self.source}: read as: {'; '.join(parts)}" if parts else ""
+        said = [f"read as: {'; '.join(parts)}"] if parts else []
+        if self.unknown:
+            said.append(f"not read: {several([one_line(name)[:40] for name in self.unknown], 12)}")
+        return f"{self.source}: {'; '.join(said)}" if said else ""
 
     def text(self) -> str:
         """A columns.yaml that says the same."""

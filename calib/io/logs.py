@@ -30,12 +30,12 @@ import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
-from calib.core.files import check_readable, is_bag, shown, to_be
+from calib.core.files import check_readable, is_bag, one_line, shown, to_be
 from calib.core.geometry import in_picture
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
-from calib.core.words import all_of
+from calib.core.words import all_of, several
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
     ACCEL,
@@ -128,7 +128,7 @@ class Log:
         lacking = [name for name in names if name not in self.columns]
         if lacking:
             has = f"has no {all_of(lacking)}, expected {all_of(names)} beside t_s"
-            raise BadInputError(f"{self.source}: {has}")
+            raise BadInputError(f"{self.source}: {has}{self.where_else(*lacking)}")
         blank = [name for name in names if np.isnan(self.columns[name]).all()]
         if blank:
             raise BadInputError(f"{self.source}: {all_of(blank)} hold{'s' * (len(blank) == 1)} no number")
@@ -159,6 +159,14 @@ class Log:
             rows, stamps, values = rows[kept], stamps[kept], values[kept]
         findings = (*watch.findings(stuck=False), *([_APART] if apart is not None else []))
         return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
+
+    def where_else(self, *names: str) -> str:
+        """What to do where one of the columns that are not read holds `names`; empty where all are read."""
+        if self.map is None or not self.unknown:
+            return ""
+        found = several([f"`{one_line(name)[:40]}`" for name in self.unknown])
+        lines = f"the line{'s' * (len(names) > 1)} {all_of([f'{name}: NAME' for name in names])}"
+        return f"; found {found}, which are not read: if one is meant, add to {self.map.folder} {lines}"
 
     def remarks(self) -> list[str]:
         """Sentences on what the columns were read as, and on what was not taken as it stands."""
@@ -640,12 +648,19 @@ class Signals:
         )  # fmt: skip
 
 
+_BEHIND = 4
+"""Rows in a row that are earlier than one before them, by which a clock was set back."""
+
+
 def check_time(log: Log) -> None:
     """Raise `BadInputError` at the first row whose time is earlier than that of the row before."""
     back = np.nonzero(np.diff(log.t_s) < 0.0)[0]
     if len(back):
         i = int(back[0]) + 1
-        anew = log.t_s[i - 1] - log.t_s[i] > SPLIT_S
+        # Rows in disorder fall back again and again, those after a clock's step stay behind for long.
+        below = int(np.count_nonzero(log.t_s < np.maximum.accumulate(log.t_s)))
+        once = len(back) == 1 and log.t_s[i - 1] - log.t_s[i] > SPLIT_S
+        anew = once or below > _BEHIND * len(back)
         advice = (
             "the recorder has begun anew, or its clock was set: cut the log there"
             if anew

@@ -75,8 +75,8 @@ def _number(text: _Text, word: str, column: str, line: int) -> float:
     return value if math.isfinite(value) else math.inf
 
 
-_BLANK = ("", "NA", "N/A", "null", "NULL", "None", "-", "--")
-"""Cells of a sensor that was not sampled, as R, pandas, JavaScript, Python and people write them."""
+_BLANK = ("", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "None", "-", "--")
+"""Cells of a sensor that was not sampled, as R, pandas, Excel, JavaScript, Python and people write them."""
 _DATE = "a date such as 2024-05-01T12:00:00.25"
 _DAY_FIRST = re.compile(r"\A(\d\d)\.(\d\d)\.(\d{4}) +")
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,:]\d+)?)")

@@ -70,6 +70,12 @@ def _written(
         ("xGyro", ("gx_radps", "")),
         ("seconds_elapsed", ("t_s", "s")),
         ("time_boot_ms", ("t_s", "ms")),
+        ("Zeit (s)", ("t_s", "s")),
+        ("Uhrzeit", ("t_s", "")),
+        ("Beschleunigung X (m/s²)", ("ax_mps2", "m/s2")),
+        ("Drehrate z (°/s)", ("gz_radps", "deg/s")),
+        ("accélération y [g]", ("ay_mps2", "g")),
+        ("velocità angolare z", ("gz_radps", "")),
         ("Magnetometer X (uT)", None),
         ("temperature", None),
         ("gear", None),
@@ -371,6 +377,9 @@ def test_a_recording_of_somebody_else(shared_data: Path) -> None:
     log = read_log(shared_data / "imufusion" / "sensor_data.csv")
     assert sorted(log.columns) == sorted(AXES)
     assert log.unknown == ("Magnetometer X (uT)", "Magnetometer Y (uT)", "Magnetometer Z (uT)")
+    assert "; not read: Magnetometer X (uT), Magnetometer Y (uT), Magnetometer Z (uT)" in log.remarks()[0]
+    with pytest.raises(BadInputError, match=r"has no u_px, .*`Magnetometer X \(uT\)`.* the line u_px: NAME"):
+        log.signals("u_px")
     start = log.t_s < 2.0
     force = np.stack([log.columns[name][start] for name in AXES[:3]], axis=1)
     assert np.median(np.linalg.norm(force, axis=1)) == pytest.approx(G, rel=0.02)

@@ -61,7 +61,7 @@ def test_nan_and_infinite_cells_count_as_blank(write) -> None:
     assert log.sampled("gz_radps").tolist() == [0]
 
 
-@pytest.mark.parametrize("blank", ["NA", "null", "None", '""'])
+@pytest.mark.parametrize("blank", ["NA", "null", "None", "n/a", "#N/A", '""'])
 def test_what_programs_write_for_nothing_is_blank(write, blank: str) -> None:
     text = f"t_s,u_px\n0,1\n1,{blank}\n2,3\n"
     for form in (text, text + '3,"4 "\n'):

@@ -172,6 +172,23 @@ def test_time_that_goes_back_and_axes_that_are_stuck() -> None:
         log.signals("gz_radps")
 
 
+@pytest.mark.parametrize(
+    ("steps", "advice"),
+    [
+        (np.random.default_rng(1).permutation(3000), "sort its rows"),
+        (np.arange(3000)[::-1], "sort its rows"),
+        (np.arange(3000) ^ 1, "sort its rows"),
+        (np.arange(3000) % 1500, "cut the log there"),
+        (np.arange(3000) - 25 * (np.arange(3000) >= 2000), "cut the log there"),
+    ],
+)
+def test_rows_in_disorder_are_told_from_a_clock_that_was_set(steps: IntArray, advice: str) -> None:
+    """Sorted, the rows from before and after a clock's step back would be mixed."""
+    log = replace(_log(), t_s=0.01 * steps)
+    with pytest.raises(BadInputError, match=advice):
+        log.signals("gz_radps")
+
+
 @pytest.fixture
 def written(tmp_path: Path) -> Callable[[IntArray], Path]:
     """Writes these rows of a log of a gyroscope and an accelerometer at rest."""

@@ -281,6 +281,7 @@ def _from_pictures(log: Log, rig: Rig, rig_path: Path, rest: float) -> tuple[Hea
     if not len(log.sampled("u_px", "v_px")):
         raise BadInputError(
             f"{log.source}: has no marker, expected u_px and v_px, or the states of calib replay beside it"
+            + log.where_else("u_px", "v_px")
         )
     pictures = log.signals("u_px", "v_px")
     found = periods(log)

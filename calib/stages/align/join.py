@@ -12,6 +12,7 @@ from calib.core.rig import Rig
 from calib.io.logs import Log
 from calib.solve.delay import Clocks, clocks
 from calib.stages.actuator.kinematics import angle_from_marker
+from calib.stages.align.solve import TURNING
 
 _MARKER = ("u_px", "v_px")
 _LONGEST_S = 6.0 * 3600.0
@@ -73,10 +74,7 @@ def joined(
             other = clocks(camera_s, -way, gyro.t_s, gyro["gz_radps"], scaled) if scaled else None
             if other is not None and other.next_left > _MIRRORED:
                 raise BadInputError(
-                    f"{camera.source}: turns the other way round than gz_radps of {board.source}, expected "
-                    "minus the rate of phi; pictures as of a selfie camera are mirrored: flip those of board "
-                    "and marker; an IMU has its x axis from the head to the base; a camera upside down may "
-                    "have read the plane's board from its other end: state first_corner_px in its board.yaml"
+                    f"{camera.source}: turns the other way round than gz_radps of {board.source}, {TURNING}"
                 )
         if found is None:
             raise BadInputError(

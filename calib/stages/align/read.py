@@ -35,9 +35,11 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
     heard, log = log.passed, unclipped(log)
     camera = log.signals("u_px", "v_px") if len(log.sampled("u_px", "v_px")) else None
     if not len(log.sampled("gz_radps")):
-        return None, [f"{log.source}: has no gyroscope (gz_radps), which an alignment needs"]
+        has = "has no gyroscope (gz_radps), which an alignment needs"
+        return None, [f"{log.source}: {has}{log.where_else('gz_radps')}"]
     if camera is None:
-        return None, [f"{log.source}: has no picture of the marker (u_px, v_px), which an alignment needs"]
+        has = "has no picture of the marker (u_px, v_px), which an alignment needs"
+        return None, [f"{log.source}: {has}{log.where_else('u_px', 'v_px')}"]
     imu = log.signals("gz_radps", optional=_ACCEL, partly=True)
     imu.refuse_stuck(*imu.names)
     imu.refuse_mirrored()

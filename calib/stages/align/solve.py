@@ -564,6 +564,16 @@ def correlation(pieces: Sequence[Piece]) -> FloatArray:
     return np.array(values)
 
 
+TURNING = (
+    "expected minus the rate of phi: an IMU with its x axis from the head to the base, z away from the "
+    "camera. For one that lies on its face state factor: -1 for ay_mps2 and gz_radps in columns.yaml, and "
+    "geometry: {imu_sign: [1, -1, -1]} in rig.yaml; pictures as of a selfie camera are mirrored: flip those "
+    "of board and marker; a camera upside down may have read the plane's board from its other end: state "
+    "first_corner_px in its board.yaml"
+)
+"""What to do where camera and gyroscope turn against each other."""
+
+
 def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     """Raise `BadInputError` for a log whose motion tells a gyroscope of another unit or sign.
 
@@ -585,9 +595,7 @@ def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
         )
     if factor < -0.3:
         raise BadInputError(
-            f"{log.source}: gz_radps turns the other way round than the camera sees, expected minus the rate "
-            "of phi (a right-handed IMU, its x axis from the head to the base); a camera upside down "
-            "may have read the plane's board from its other end: state first_corner_px in its board.yaml"
+            f"{log.source}: gz_radps turns the other way round than the camera sees, {TURNING}"
         )
 
 

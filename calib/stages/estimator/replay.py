@@ -741,8 +741,11 @@ def _late(setup: Setup, rows: Rows) -> list[str]:
             return False
         return likelihood(names, shift) > max(known, likelihood(names, -shift)) + _GAIN
 
+    sensed = {name for k, name in enumerate(READINGS) if np.isfinite(rows.readings[:, k]).any()}
+    # Readings are late against others.
+    searched = [names for names in _TOGETHER if sensed.intersection(names) and sensed.difference(names)]
     found: dict[tuple[str, ...], tuple[float, int]] = {}
-    for names, shift in product(_TOGETHER, _SHIFTS):
+    for names, shift in product(searched, _SHIFTS):
         if gains(names, shift):
             step = 1 if shift > 0 else -1
             while abs(shift) < _LATEST and likelihood(names, shift + step) > likelihood(names, shift):
