@@ -380,6 +380,39 @@ def test_units_that_no_arm_has_are_told() -> None:
         assert any(words in text for text in said)
 
 
+def test_pressures_from_vacuum_are_told() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial)
+    assert "vacuum" not in _said(columns, trial)
+    assert "poor: a: its pressure is 10" in _said(columns | {"p1_kpa": columns["p1_kpa"] + 101.3}, trial)
+
+
+def test_poses_of_zeros_were_not_seen() -> None:
+    trial = simulated("a", 1)
+    columns = {name: column.copy() for name, column in columns_of(trial).items()}
+    for name in columns:
+        if name.startswith("tip_"):
+            columns[name][300:320] = 0.0
+    recording = recording_of(_log(columns, trial), "a")
+    assert recording.turned is not None
+    assert np.flatnonzero(np.isnan(recording.turned[0]).any(axis=1)).tolist() == list(range(300, 320))
+    assert "jumps" not in "; ".join(one.text for one in recording.findings)
+
+
+def test_base_and_tip_that_are_swapped_are_told() -> None:
+    trial = simulated("a", 1)
+    columns = columns_of(trial, conjugated=True)
+    other = {"base": "tip", "tip": "base"}
+    swapped = {
+        f"{other[of]}_{rest}": columns[name]
+        for name in columns
+        for of, _, rest in [name.partition("_")]
+        if of in other
+    }
+    found = frame_findings(frame_of([recording_of(_log(columns | swapped, trial), "a")]))
+    assert any("1.55 of the tip's angle, expected about half of it" in one.text for one in found)
+
+
 def test_quaternions_in_another_order_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)

@@ -231,6 +231,13 @@ def test_a_wrong_size_is_known_after_two_pictures(
     assert searched == [(9, 6)] * 2
 
 
+def test_texture_as_small_as_a_stamp_is_no_board_of_a_wrong_size(shared_data: Path) -> None:
+    """An `8x6 board` of a hundredth of the picture was found in eight of these."""
+    pictures = sorted((shared_data / "opencv_left").glob("*.jpg"))
+    with pytest.raises(BadInputError, match=r"no board with 8x6 .* any of 13 pictures, but one with 9x6 was"):
+        find_boards(pictures, (8, 6), 0.025)
+
+
 def test_the_board_of_several_folders(tmp_path: Path) -> None:
     one, two, none = (tmp_path / name for name in ("one", "two", "none"))
     for folder in (one, two, none):

@@ -38,7 +38,7 @@ def test_what_logs_without_commands_do_not_tell_is_named(calib: Run, tmp_path: P
         names.append(path.name)
     ended = calib("identify", *names, "--no-compare", cwd=tmp_path)
     assert ended.code == 0, ended.err
-    untold = "valve, creep: the prior's, these logs do not tell"
+    untold = "valve, creep_s: the prior's, these logs do not tell"
     assert f"{untold}; it takes steps of the command" in ended.out
     assert "held trials, angle from the pressure" in ended.out
     assert "angle from the command" not in ended.out

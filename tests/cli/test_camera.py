@@ -60,7 +60,7 @@ def test_a_wrong_size_is_answered_with_what_was_found(calib, pictures, tmp_path)
     assert ended.code == 3
     assert ended.sentence == (
         "view01.png ... view04.png: no board with 8x6 inner corners found in any of 4 pictures, "
-        "but one with 7x5 was"
+        "but one with 7x5 was: state these, which are one less than the squares"
     )
     assert not rig.exists()
     ended = calib("intrinsics", folder, *RADIAL2, "--rig", rig, "--corners", "7x5", "--square", "2cm")

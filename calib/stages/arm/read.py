@@ -31,6 +31,10 @@ _LEAST_TURN_RAD = math.radians(2.0)
 _NO_PLANE_RAD = math.radians(45.0)
 _LONGEST_M, _MOST_KPA, _LEAST_KPA, _MOST_TURN_RAD = 3.0, 2000.0, 5.0, 2.0 * math.pi
 """No soft arm is so long, takes so much or rolls up twice; hardly one bends by so little a pressure."""
+_AIR_KPA = (80.0, 110.0)
+"""Pressure of the air, from 2000 m above the sea down to it, with what a vented chamber is off."""
+_LEANS = (0.1, 1.0)
+"""Turn of the chord over the tip's: a half of an arc, more with a stiff end, less with a stiff beginning."""
 _JUMP_SHARE = 0.03
 """Of the chord, between neighbours."""
 _STILL, _MOVES = 1e-9, 0.2
@@ -94,7 +98,7 @@ class Recording:
 
 
 def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors and chords (2, n, 3) as in `Recording`, NaN in rows without a pose.
+    """Rotation vectors and chords (2, n, 3) as in `Recording`, NaN in rows without a pose or of zeros.
 
     Raises `BadInputError` for quaternions that are none.
     """
@@ -103,14 +107,18 @@ def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
     read = {name: log.columns[name] for name in (*POSITION, *QUATERNION)}
     base, tip = (np.stack([read[f"{of}_q{k}"] for k in "wxyz"], axis=1) for of in ("base", "tip"))
     for of, q in (("base", base), ("tip", tip)):
+        # So says motion capture that it has lost a body.
+        q[~q.any(axis=1)] = np.nan
         norm = np.linalg.norm(q, axis=1)
         wrong = np.nonzero(np.abs(norm - 1.0) > 0.02)[0]
         if len(wrong):
             raise BadInputError(
                 f"{log.source}, line {log.lines[wrong[0]]}: the quaternion {of}_qw, ... has norm "
-                f"{norm[wrong[0]]:.4g}, expected 1"
+                f"{norm[wrong[0]]:.4g}, expected 1, or blanks where the body was not seen"
             )
     seen = np.isfinite(base).all(axis=1) & np.isfinite(tip).all(axis=1)
+    if not seen.any():
+        raise BadInputError(f"{log.source}: no row has poses of base and tip, expected both")
     turned, chord = np.full((2, 2, len(tip), 3), np.nan)
     first, last = (Rotation.from_quat(q[seen][:, [1, 2, 3, 0]]) for q in (base, tip))
     apart = np.stack([read[f"tip_{k}_m"] - read[f"base_{k}_m"] for k in "xyz"], axis=1)
@@ -257,6 +265,15 @@ def _in_units(recording: Recording) -> list[Finding]:
             f"{source}: pressures reach {most:.4g} kPa, expected at most {_MOST_KPA:g}; columns.yaml takes "
             "Pa, each column with factor: 0.001"
         )
+    if recording.command is not None and recording.pressure is not None:
+        asked, least = (float(np.nanpercentile(one, 1.0)) for one in (recording.command, recording.pressure))
+        if _AIR_KPA[0] < least < _AIR_KPA[1] and least - asked > _AIR_KPA[0]:
+            text = (
+                f"{recording.name}: its pressure is {least:.4g} kPa at the least, where the command goes "
+                f"down to {asked:.3g} kPa, as one that counts from vacuum"
+            )
+            advice = "columns.yaml takes off the air's from such a column with offset: 101.3"
+            return [Finding("poor", text, advice)]
     if 0.0 < most < _LEAST_KPA:
         text = f"{recording.name}: pressures reach {most:.3g} kPa at most, as bar would"
         return [Finding("poor", text, "look for their unit; columns.yaml takes bar with factor: 100")]
@@ -385,6 +402,12 @@ def frame_findings(frame: Frame) -> Iterator[Finding]:
         f"({u:z.2f}, {v:z.2f}, {w:z.2f}); the chord turns by {abs(frame.leans):.2f} of the tip's angle",
     )
     stands = f"the axis of bending stands {frame.planar_deg:.0f} deg off the normal of the tip's path"
+    if not _LEANS[0] < abs(frame.leans) < _LEANS[1]:
+        yield Finding(
+            "poor",
+            f"the chord turns by {abs(frame.leans):.2f} of the tip's angle, expected about half of it",
+            "look whether base and tip are swapped, and whether their quaternions are of one convention",
+        )
     if math.radians(frame.planar_deg) > _NO_PLANE_RAD:
         advice = "look at the order of the quaternions, w first, and at the axes of base and tip"
         yield Finding("inconsistent", stands, advice)

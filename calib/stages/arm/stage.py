@@ -235,7 +235,6 @@ def _far(found: Identification) -> Iterator[Finding]:
 
 
 def _untold(found: Identification) -> Iterator[Finding]:
-    from calib.core.words import as_words
     from calib.stages.arm.model import PARAMETERS, PARTS
 
     vague = {p.name for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD}
@@ -244,7 +243,7 @@ def _untold(found: Identification) -> Iterator[Finding]:
     for part in PARTS:
         mine = [one for one in part.parameters if one.name in vague and part.name in found.fit.assembly.parts]
         whole = len(mine) == len(part.parameters)
-        untold |= dict.fromkeys([part.name] if whole else [as_words(one.name) for one in mine])
+        untold |= dict.fromkeys([part.name] if whole else [one.name for one in mine])
         takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
     if untold:
         yield Finding(

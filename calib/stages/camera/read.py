@@ -32,10 +32,12 @@ from calib.io.pictures import (
     usual_size,
 )
 from calib.stages.camera import targets
+from calib.stages.camera.checks import hull_area
 from calib.stages.camera.choice import most_informative
 from calib.stages.camera.corners import Detection, between_fields, detect, find_size
 from calib.stages.camera.model import Board, LeftOut, View
 from calib.stages.camera.options import Told
+from calib.stages.camera.verdict import Limits
 
 # ----------------------------------------------------------------------
 # board.yaml, and the search for its board in a set of pictures.
@@ -331,7 +333,7 @@ class _Search:
             if wanted is None:
                 break
             found |= self._detect(part, wanted)
-            other = None if any(found.values()) else self._common_size(sample, share)
+            other = None if self._are_large(found) else self._common_size(sample, share)
             if other is not None and sorted(other) != sorted(wanted):
                 raise BadInputError(_not_found(pictures, wanted, other))
         if not any(found.values()):
@@ -442,6 +444,11 @@ class _Search:
             raise BadInputError(_not_found(self.pictures, corners, (columns, rows), "a ChArUco board"))
         return replace(layout, rows=stated[1] + 1)
 
+    def _are_large(self, found: Mapping[int, Detection | None]) -> bool:
+        """Whether a board is large enough to be meant: texture as small as a stamp passes for any."""
+        least = Limits.view_poor * math.prod(self.size_px)
+        return any(hull_area(one.pixels) >= least for one in found.values() if one is not None)
+
     def _detect(self, which: Sequence[int], corners: tuple[int, int]) -> dict[int, Detection | None]:
         return self._counted(which, [(detect, i, corners) for i in which])
 
@@ -485,7 +492,11 @@ def _most_common(sizes: Sequence[tuple[int, int] | None], least: float) -> tuple
 def _not_found(
     pictures: Sequence[Picture], wanted: tuple[int, int], other: tuple[int, int] | None, what: str = "one"
 ) -> str:
-    instead = "and no other either" if other is None else f"but {what} with {other[0]}x{other[1]} was"
+    instead = "and no other either"
+    if other is not None:
+        instead = (
+            f"but {what} with {other[0]}x{other[1]} was: state these, which are one less than the squares"
+        )
     return (
         f"{_names(pictures)}: no board with {wanted[0]}x{wanted[1]} inner corners found in "
         f"{_count(len(pictures))}, {instead}"
