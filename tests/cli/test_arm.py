@@ -12,7 +12,9 @@ from .conftest import Run
 
 def test_an_arm_is_identified_and_predicted(calib: Run, tmp_path: Path) -> None:
     days = (("a", 1.0), ("a", 1.0), ("b", 1.1), ("b", 1.1))
-    trials = [simulated(f"{day}_{k}", k, day, gain=gain) for k, (day, gain) in enumerate(days)]
+    trials = [
+        simulated(f"{day}_{k}", k, day, gain=gain, duration_s=20.0) for k, (day, gain) in enumerate(days)
+    ]
     names = [written(tmp_path, one).name for one in trials]
     ended = calib("identify", *names, "--no-compare", cwd=tmp_path)
     assert ended.code == 0, ended.err
@@ -31,7 +33,7 @@ def test_an_arm_is_identified_and_predicted(calib: Run, tmp_path: Path) -> None:
 def test_what_logs_without_commands_do_not_tell_is_named(calib: Run, tmp_path: Path) -> None:
     names = []
     for k in range(3):
-        path = written(tmp_path, simulated(f"a_{k}", k))
+        path = written(tmp_path, simulated(f"a_{k}", k, duration_s=20.0))
         lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
         left = [j for j, name in enumerate(lines[0]) if not name.startswith("p_cmd")]
         path.write_text("\n".join(",".join(row[j] for j in left) for row in lines) + "\n", encoding="utf-8")

@@ -211,8 +211,8 @@ class _Problem:
     def solve(self, model: _Model, z: FloatArray, free: IntArray) -> tuple[FloatArray, FloatArray]:
         """z with its free entries where errors and deviations are least, and their covariance."""
         rows, slopes = partial(self.rows, model, z, free), partial(self.slopes, model, z, free)
-        found = least_squares(rows, z[free], jac=slopes, max_nfev=25, ftol=1e-3)
-        J, out = slopes(found.x), z.copy()
+        found, out = least_squares(rows, z[free], jac=slopes, max_nfev=25, ftol=1e-3), z.copy()
+        J = np.asarray(found.jac)
         out[free] = found.x
         return out, np.asarray(np.linalg.inv(J.T @ J), dtype=np.float64)
 

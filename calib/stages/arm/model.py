@@ -41,6 +41,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -266,10 +267,17 @@ class Trial:
     pwm: bool = False
     unseen: BoolArray | None = None
 
+    @cached_property
+    def begins(self) -> tuple[float, float, float]:
+        """What pressure [kPa], angle [rad] and chord [m] start from; 0 where they were not logged.
 
-def begun(values: FloatArray) -> float:
-    """What a signal (n,) starts from: a single reading may be none."""
-    return float(np.median(values[:_BEGINS]))
+        A single reading may be none.
+        """
+        kpa, rad, m = (
+            float(np.median(values[:_BEGINS])) if len(values) else 0.0
+            for values in (self.pressure_kpa, self.angle_rad, self.chord_m)
+        )
+        return kpa, rad, m
 
 
 @kernel()
@@ -371,10 +379,9 @@ def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
 
     The drive is the one whose parameters are among `values`.
     """
-    start = begun(trial.pressure_kpa) if len(trial.pressure_kpa) else 0.0
     name = next(one for one, names in DRIVES.items() if names[0] in values)
     q = np.array([values[one] for one in DRIVES[name]])
-    return np.asarray((_valve if name == "valve" else _lag)(trial.command, start, q))
+    return np.asarray((_valve if name == "valve" else _lag)(trial.command, trial.begins[0], q))
 
 
 def segment_run(
@@ -383,7 +390,7 @@ def segment_run(
     """Angle [rad] and chord [m], each (n,), that follow from a pressure (n,) and from the first poses."""
     q = np.array([values[name] for name in SEGMENT])
     moment = trial.load_kg * GRAVITY_MPS2 * values["chord_m"]
-    out = _segment(pressure_kpa, begun(trial.angle_rad), begun(trial.chord_m), q, moment)
+    out = _segment(pressure_kpa, *trial.begins[1:], q, moment)
     return out[:, 0], out[:, 1]
 
 
@@ -393,7 +400,7 @@ class Assembly:
 
     parts: tuple[str, ...]
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Parameters of its parts."""
         return tuple(one.name for part in PARTS if part.name in self.parts for one in part.parameters)

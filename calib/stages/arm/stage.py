@@ -157,7 +157,7 @@ def _solve(
 def judge(found: Identification) -> Iterator[Finding]:
     """What the held trials, the baselines and the posterior say of an identification."""
     from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
-    from calib.stages.arm.model import DAILY, begun
+    from calib.stages.arm.model import DAILY
 
     if not any(len(one.angle_rad) for one in found.trials):
         yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
@@ -209,9 +209,9 @@ def judge(found: Identification) -> Iterator[Finding]:
     for trial in found.trials:
         if not len(trial.angle_rad):
             continue
-        phi = begun(trial.angle_rad)
+        _, phi, chord_m = trial.begins
         curve = values["chord_m"] + values["chord_m_per_rad"] * phi + values["chord_m_per_rad2"] * phi**2
-        short = curve - begun(trial.chord_m)
+        short = curve - chord_m
         if short > _SHORT * values["chord_m"]:
             yield Finding(
                 "remark", f"{trial.name} starts {1e3 * short:.1f} mm too short: a vented start, it settles"
