@@ -101,12 +101,16 @@ def test_another_thing_in_place_of_the_marker_does_not_pull() -> None:
     assert found.values["damping_scale_free_swing"] == pytest.approx(2.8, rel=0.05)
 
 
-def test_what_a_log_cannot_tell_is_named_and_fixed() -> None:
-    """Two pumps alike never bend the rig, so nothing is said about bending."""
-    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)])
-    assert "bending_N_per_rad2" not in found.values
-    assert "the logs" in found.fixed["bending_N_per_rad2"]
-    assert "lag_s" in found.values
+@pytest.fixture(scope="module")
+def of_steps() -> Solution:
+    """Two pumps alike, which never bend the rig."""
+    return fit_tracks(Machine(), [track("steps", duration_s=8.0)])
+
+
+def test_what_a_log_cannot_tell_is_named_and_fixed(of_steps: Solution) -> None:
+    assert "bending_N_per_rad2" not in of_steps.values
+    assert "the logs" in of_steps.fixed["bending_N_per_rad2"]
+    assert "lag_s" in of_steps.values
 
 
 def test_what_a_person_states_is_fixed_or_a_prior() -> None:
@@ -345,6 +349,7 @@ def test_a_log_held_back_is_predicted_as_well_as_fitted(solution: Solution) -> N
     assert held_back(alone) == []
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize("other", [{}, {"stiffness_scale": 1.05}, {"lag_s": 0.8}])
 def test_a_log_of_another_plant_is_contradicted_and_one_that_tells_more_is_not(
     other: dict[str, float],
@@ -626,9 +631,8 @@ def test_experiments_shrink_and_rest_does_not() -> None:
     assert worst == sorted(worst) and set(ahead) == set(EXPERIMENTS)
 
 
-def test_what_could_not_be_told_is_what_is_asked_for() -> None:
-    found = fit_tracks(Machine(), [track("steps", duration_s=8.0)])
-    best, *_, last = prospects(found, uncertainty(found))
+def test_what_could_not_be_told_is_what_is_asked_for(of_steps: Solution) -> None:
+    best, *_, last = prospects(of_steps, uncertainty(of_steps))
     assert best.name in ("prbs", "chirp") and last.name == "static"
     assert best.relative["bending_N_per_rad2"] < 0.2
 

@@ -252,14 +252,14 @@ def test_a_vacuum_pump_is_a_pump_that_counts_downward(found: PumpFound) -> None:
 
 
 def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
-    t = 0.02 * np.arange(250)
+    t = 0.04 * np.arange(125)
     pwm = np.where(t > 0.03, 255.0, 0.0)
     y = 25.0 * -np.expm1(-np.maximum(t - 0.1, 0.0) / 0.5)
-    runs = [PumpRecord(f"run{k}", t, pwm, y + 0.02 * np.sin(40.0 * t + k)) for k in range(3)]
+    runs = [PumpRecord(f"run{k}", t, pwm, y + 0.02 * np.sin(40.0 * t + k)) for k in range(2)]
     runs.append(PumpRecord("odd", t, pwm, y + 6.0 * np.clip(t - 2.0, 0.0, 1.0)))
     odd = identify_pump([_table(r) for r in runs])
     said = [one.text for one in unexplained(odd)]
-    assert "settle apart: 3 at 25.0 kPa" in said[0]
+    assert "settle apart: 2 at 25.0 kPa" in said[0]
     assert "odd leaves the model" in said[1]
     assert "while the PWM stood still" in said[1]
     verdict = judge_pump(odd)

@@ -95,7 +95,7 @@ def _logged(ticks: int, seed: int) -> list[Inputs]:
 
 def test_directed_ticks(built: tuple[Header, list[str], Path]) -> None:
     made, command, _ = built
-    ticks = directed(made.values, 4000)
+    ticks = directed(made.values, 1500)
     worst, undecided = compare(made, ticks, run(command, ticks))
     assert (worst <= LIMITS).all(), worst
     assert undecided <= 0.01
