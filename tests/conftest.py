@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
 from collections import Counter
 from collections.abc import Generator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,7 @@ SMOKE = (
 """A part of every floor of the house, for the inner loop: `pytest -m smoke`."""
 
 
+@cache
 def _is_smoke(path: Path) -> bool:
     return any(path.is_relative_to(ROOT / "tests" / part) for part in SMOKE)
 
@@ -80,6 +83,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             places[test] += 1
         if _is_smoke(item.path) and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.smoke)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, Any, Any]:
+    """Thousands of tests and all modules stay to the end: the collector of garbage need not look at them."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session")
