@@ -254,6 +254,7 @@ def _shifted(
     return replace(block, intrinsics=intrinsics, R_CT=R, t_CT_m=t, deformation=deformation)
 
 
+@pytest.mark.few(2, 9, 11)
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("kind", ["rigid", "warp"])
 @given(seed=st.integers(0, 1000))
@@ -514,6 +515,7 @@ def test_one_step_tells_the_skew_that_a_fit_finds() -> None:
     assert 0.05 < told.moved_px < 0.4
 
 
+@pytest.mark.slow
 def test_real_pictures_without_a_skew_get_none(shared_data: Path) -> None:
     views = read_views([outside(shared_data / "opencv_left")], Told())
     assert LensModel.of(calibrate_camera(views.views, views.image_size_px).calibration) == LensModel("brown5")

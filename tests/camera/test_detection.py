@@ -307,6 +307,7 @@ def test_indices_keep_their_corners_at_every_angle(size: tuple[int, int]) -> Non
             assert gray[round(v), round(u)] < gray[round(bright[1]), round(bright[0])]
 
 
+@pytest.mark.few(1, 3)
 @pytest.mark.parametrize(
     ("what", "sensor"),
     [

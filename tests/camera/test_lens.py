@@ -270,6 +270,7 @@ def test_where_the_radial_curve_folds(distortion: list[float], radius: float) ->
         assert distorted == pytest.approx(top)
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize(
     ("distortion", "reach"),
     [([-1 / 3, 0, 0, 0, 0, 0, 0, 0], 2 / 3), ([0, 0, 0, 0, 0, -1.0, 0, 0], 1.0), ([0.3] + [0.0] * 7, np.inf)],

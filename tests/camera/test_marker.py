@@ -132,6 +132,7 @@ def test_what_covers_the_marker_makes_it_lost_and_not_wrong() -> None:
     assert max(off) < 0.5
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("radius_px", [9.0, 20.0])
 def test_a_hose_before_a_part_makes_it_lost_or_unsure(radius_px: float) -> None:
     """A grey bar crosses a disc that rests."""

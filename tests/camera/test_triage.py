@@ -110,6 +110,7 @@ def test_a_bad_view_leaves(kind: str, count: int, seed: int) -> None:
         assert kept.verdict.reasons[0].startswith("bad does not agree with the others: ")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "kinds", [("zoom 0.9", "zoom 0.9"), ("shear 8 px", "mirrored"), ("blur", "wavy 2 px")]
 )
@@ -136,7 +137,7 @@ def _turned(view: View, how: str) -> View:
     return replace(view, pixels=pixels[order])
 
 
-@pytest.mark.few(0, 3)
+@pytest.mark.few(0)
 @pytest.mark.parametrize(
     ("how", "count", "bad"),
     [
@@ -168,6 +169,7 @@ def test_views_as_taken_are_not_turned(off_centre_px: tuple[float, float]) -> No
         assert turned_views(calibrate(pack(views), SIZE, "radial2")) == []
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("bow", [0.005, 0.01])
 def test_pictures_of_a_bent_board_are_not_turned(bow: float) -> None:
     """The bow pulls the centre to one side or the other with the tilt, as turning a picture would."""

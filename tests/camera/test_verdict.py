@@ -425,6 +425,7 @@ def test_a_start_that_ends_lower_is_taken(monkeypatch: pytest.MonkeyPatch) -> No
     assert found.calibration.camera.fx_px == pytest.approx(best.calibration.camera.fx_px, rel=1e-3)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("seed", range(2))
 def test_a_view_in_disorder_leaves(seed: int) -> None:
     views = views_of(12, 1, 0.1)

@@ -323,13 +323,13 @@ def test_states_are_no_better_than_the_alignment(
 def test_several_logs_go_to_a_folder_with_figures(
     calib: Run, aligned: Path, log_file: Callable[..., Path], tmp_path: Path
 ) -> None:
-    logs = [log_file("swing", 0), log_file("swing", 1)]
+    logs = [log_file("swing", 0), log_file("elongation", 0)]
     ended = calib(
         "replay", *logs, "--rig", aligned, "-o", tmp_path / "out", "--figures", tmp_path / "figures"
     )
     assert ended.code == 0
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert names == ["swing0_states.csv", "swing1_states.csv"]
+    assert names == ["elongation0_states.csv", "swing0_states.csv"]
     assert len(list((tmp_path / "figures").glob("*.png"))) == 6
 
 

@@ -314,6 +314,7 @@ def _commands_computed_torque(model: Model, q: np.ndarray, control: ComputedTorq
     return np.array(out)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("model", "horizon"), [(NOMINAL, 1), (NOMINAL, 12), (ORIFICE, 6)])
 def test_with_a_perfect_model_the_ellipse_is_drawn(model: Model, horizon: int) -> None:
     """Whole PWM values and all: 0.03 mm, where PD with feed-forward is 0.8 mm off on the same plant."""

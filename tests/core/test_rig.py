@@ -162,6 +162,7 @@ def _places(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]
         yield place
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("value", [math.nan, 1e300])
 def test_no_number_of_a_whole_rig_may_be_endless(project_root: Path, value: float) -> None:
     whole = yaml.safe_load((project_root / "tests" / "goldens" / "twin_run" / "rig.yaml").read_text())
@@ -395,6 +396,7 @@ CHANGED_PLANE = (
 )
 
 
+@pytest.mark.few(0, 4)
 @pytest.mark.parametrize(
     ("name", "old", "new"),
     [

@@ -104,6 +104,7 @@ def test_a_camera_on_a_faster_clock_is_told(pace: float) -> None:
     assert abs(pace) < 0.01 or "% slower than the IMU's" in told[0].text
 
 
+@pytest.mark.slow
 def test_readings_renewed_by_the_sensors_own_clock_weigh_less_where_they_change() -> None:
     """400 a second, 1 % fast, as of a BNO055: they are up to 2.5 ms old, by a beat as fast as the swing."""
     trial = draw(1)
@@ -122,6 +123,7 @@ def test_readings_renewed_by_the_sensors_own_clock_weigh_less_where_they_change(
     assert np.abs(np.delete(scores(trial, found), OFFSET)).max() < 3.0
 
 
+@pytest.mark.slow
 def test_the_clocks_steps_are_in_the_offset() -> None:
     """A float32 after a day is averaged over; of a tick of the IMU's own period the phase is not known."""
     trial = known(SimulatedRig())

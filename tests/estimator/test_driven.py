@@ -251,6 +251,7 @@ def test_commands_carry_it_through_four_seconds_without_readings() -> None:
 WEIGHT = OUT.index("driven_weight")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["ellipse", "step"])
 def test_commands_that_are_missing_cost_little_and_are_paid_for(name: str) -> None:
     """One in twenty is not in the log: held until the next, they cost 0.19 mm at a NEES of 12 to 20."""
@@ -599,6 +600,7 @@ def test_smoothed_angles_of_a_swing_are_as_sure_as_they_say_from_its_beginning()
     assert np.mean(squares) < 1.5
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize("name", ["elongation", "step"])
 def test_smoothing_lessens_the_error(name: str) -> None:
     figures = []

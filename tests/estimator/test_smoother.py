@@ -20,6 +20,7 @@ from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["swing", "ellipse", "elongation"])
 def test_smoothing_halves_the_error_and_tells_it(name: str) -> None:
     figures = []

@@ -128,6 +128,7 @@ def _told(name: str, cycles: np.ndarray) -> int:
     return most
 
 
+@pytest.mark.slow
 def test_the_budget_of_the_thesis_tick(tmp_path: Path) -> None:
     """Angle filter, homography, low-pass, inverse kinematics, PD with feed-forward, in every tick."""
     still = [(0.08, 0.085)] * 1200

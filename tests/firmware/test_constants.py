@@ -143,6 +143,7 @@ def test_every_macro_is_read_or_says_what_it_is_for(kind: str) -> None:
             assert mentioned or "programs of your own" in group or name == "CALIB_LENS_INVERSE_ORDER", name
 
 
+@pytest.mark.slow
 def test_cppcheck_finds_what_the_manual_gives_reasons_for(tmp_path: Path) -> None:
     """Nothing by its own rules, and of MISRA C's those alone that stand in the manual."""
     need("cppcheck")

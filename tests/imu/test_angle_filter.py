@@ -739,6 +739,7 @@ def test_a_knock_does_not_bend_the_smoothed_angle() -> None:
     assert found.scale == pytest.approx(1.005, abs=0.005)
 
 
+@pytest.mark.few(1, 4)
 @pytest.mark.parametrize("factor", [0.5, 0.85, 1.2, 2.0, -1.0])
 def test_a_reference_that_turns_too_far_is_named(factor: float) -> None:
     """As a camera's does whose picture is mirrored, stretched, or of another plane."""

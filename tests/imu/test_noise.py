@@ -220,6 +220,7 @@ def test_a_rig_that_is_held_in_a_hand_is_not_at_rest() -> None:
     assert any("more than any gyroscope has" in text for text in judged.reasons)
 
 
+@pytest.mark.few(0)
 @pytest.mark.parametrize(("axis", "size"), [(2, np.radians(0.3)), (4, 0.2)])
 def test_a_bias_that_drifts_as_the_sensor_warms_up_makes_it_poor(axis: int, size: float) -> None:
     log, _ = rest_log(replace(IMU, gyro_walk=0.0, accel_walk=0.0), 720.0, 5)
@@ -239,6 +240,7 @@ def test_noise_and_a_walk_are_no_steps_and_no_drift() -> None:
         assert not any("drifts" in text for text in judge(found).reasons)
 
 
+@pytest.mark.few(1, 2)
 @pytest.mark.parametrize(
     ("axis", "size", "lasts_s", "word"),
     [(4, 0.005, 0.5, "ok"), (4, 0.005, 5.0, "ok"), (2, 0.002, 0.5, "poor")],
@@ -286,6 +288,7 @@ def test_white_noise_is_found_behind_a_filter_and_in_readings_that_are_held(
     assert np.max(np.abs(z)) < 3.5
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("spread", "told"), [(0.15, True), (0.3, True), (0.8, False)])
 def test_readings_with_less_noise_than_a_step_have_a_bias_that_their_rounding_shifts(
     spread: float, told: bool
@@ -337,6 +340,7 @@ def test_degrees_of_freedom_are_those_of_greenhall_and_riley(kind: int, alpha: i
         assert np.allclose(degrees_of_freedom(m, [n], theta), theirs, rtol=0.05)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("white", "walk"), [(1.0, 0.0), (0.0, 1.0), (1.0, 0.1)])
 def test_the_covariance_of_variances_is_met(white: float, walk: float) -> None:
     rng, n, m = np.random.default_rng(3), 300, np.array([2, 8, 9, 32])

@@ -172,6 +172,7 @@ def test_a_recording_that_was_cut_is_told_what_mends_it(form: str, said: str, tm
     assert re.search(said, _refused(path))
 
 
+@pytest.mark.few(0, 3, 4)
 @pytest.mark.parametrize("form", KINDS_OF_FORMAT)
 def test_damaged_bytes_are_refused_or_read_never_raised(form: str, tmp_path: Path) -> None:
     path = write_bag(tmp_path, form, readings(np.random.default_rng(0), 0.2))

@@ -102,6 +102,7 @@ def test_it_reads_the_same(tmp_path: Path, reader: str, how: str) -> None:
     assert read(path) == wanted
 
 
+@pytest.mark.few(0, 4, 8)
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_logs_of_utf_16_and_of_any_line_ends(tmp_path: Path, encoding: str, end: str) -> None:

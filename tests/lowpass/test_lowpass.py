@@ -190,6 +190,7 @@ def test_the_noise_gain_is_the_sum_of_squares(order: int, family: str) -> None:
     assert noise_gain(sections) == pytest.approx(float(np.sum(sosfilt(sections, impulse) ** 2)), rel=1e-9)
 
 
+@pytest.mark.few(0, 2)
 @pytest.mark.parametrize(("cutoff_hz", "order"), [(1.0, 1), (0.1, 2), (0.03, 4), (0.03, 7)])
 def test_a_slow_filter_rests_where_its_input_is(cutoff_hz: float, order: int) -> None:
     """The firmware's form, where the direct form of the same coefficients stays off by much more."""

@@ -38,6 +38,7 @@ def _drawn(rng: np.random.Generator, n: int, slope: float, dirty: float) -> Drif
     return _line(t, x, sigma)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("n", "dirty"), [(20, 0.0), (100, 0.0), (100, 0.1)])
 def test_the_slope_is_as_good_as_its_sigma_says(n: int, dirty: float) -> None:
     rng = np.random.default_rng(n)

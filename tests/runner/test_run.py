@@ -350,6 +350,7 @@ def test_a_fault_at_any_write_is_one_sentence_and_the_next_run_ends_the_same(
     assert refused > count // 16
 
 
+@pytest.mark.few(0, 3)
 @pytest.mark.parametrize("largest", [0, 1, 40, 300, 1000, 4000])
 def test_files_that_cannot_grow(
     folders: tuple[Path, Path, dict[str, bytes], dict[str, bytes]], tmp_path: Path, largest: int

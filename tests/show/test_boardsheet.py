@@ -34,6 +34,7 @@ def _raster(tool: str, pdf: bytes, folder: Path) -> np.ndarray:
     return cv2.imread(str(folder / "board.png"), cv2.IMREAD_GRAYSCALE)
 
 
+@pytest.mark.few(1, 2)
 @pytest.mark.parametrize(
     ("columns", "rows", "square_m", "page", "across"),
     [
