@@ -78,7 +78,8 @@ def live(
     frames = source_of(source, album.images)
     board, views, size_px = album.open(told)
     stated = told.corners or (None if board.corners is None else (board.corners[0], board.corners[1]))
-    session = Session(stated, board.square_m if told.square_m is None else told.square_m, size_px)
+    square_m = board.square_m if told.square_m is None else told.square_m
+    session = Session(stated, square_m, size_px, board.dictionary)
     session.views.update((view.name, view) for view in views)
     if views:
         narrate(f"{shown(album.images)}: going on with {len(views)} pictures")

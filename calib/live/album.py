@@ -71,11 +71,6 @@ class Album:
         """
         make_folder(self.images)
         board = read_board_file(self.images)
-        if board.dictionary is not None:
-            raise BadInputError(
-                f"{shown(self.images / BOARD_FILE)}: tells a ChArUco board, expected a checkerboard; calib "
-                "intrinsics reads pictures of this one"
-            )
         stated = None if board.corners is None else (board.corners[0], board.corners[1])
         for flag, here, there in (
             ("--corners", told.corners, stated),
@@ -110,12 +105,11 @@ class Album:
         """Write a picture as it was taken. Raises `BadInputError`."""
         write_atomically(self.images / name, png, _PICTURE)
 
-    def describe(self, corners: tuple[int, int], square_m: float | None) -> None:
+    def describe(self, board: BoardFile) -> None:
         """Write board.yaml where there is none."""
         path = self.images / BOARD_FILE
         if not path.exists():
-            square = "" if square_m is None else f"square_m: {square_m:g}\n"
-            write_atomically(path, f"corners: [{corners[0]}, {corners[1]}]\n{square}", _BOARD)
+            write_atomically(path, _written(board), _BOARD)
 
     def picture(self, name: str) -> Path | None:
         """Where a picture of this name is, dropped or not; None for what is none."""
@@ -156,10 +150,7 @@ class Album:
             move(path, place / path.name)
         new = [self.plane / BOARD_FILE, self.plane / "plane001.png"]
         try:
-            text = yaml.safe_dump(
-                board.model_dump(exclude_unset=True), sort_keys=False, default_flow_style=None
-            )
-            write_atomically(new[0], text, _BOARD)
+            write_atomically(new[0], _written(board), _BOARD)
             write_atomically(new[1], png, _PICTURE)
             plane: Plane = self._carried_out("extrinsics", self.plane)
         except BadInputError:
@@ -196,6 +187,12 @@ def fit_of(album: Album | None) -> Intrinsics | None:
     import calib.runner.work  # noqa: F401  takes longer to load than some pictures to fit
 
     return None if album is None else album.calibrate().evidence
+
+
+def _written(board: BoardFile) -> str:
+    """board.yaml of what is known of a board."""
+    known = board.model_dump(exclude_none=True, exclude_unset=True)
+    return str(yaml.safe_dump(known, sort_keys=False, default_flow_style=None if board.corners else False))
 
 
 def _names(folder: Path) -> list[str]:

@@ -15,7 +15,6 @@ from calib.core.arrays import FloatArray, GrayImage
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.live.session import Seen, Session, foremost
-from calib.stages.camera.corners import detect
 from calib.stages.camera.model import Board
 from calib.stages.camera.plane import settle_orientation, turns_of
 from calib.stages.camera.read import BoardFile
@@ -60,14 +59,16 @@ class Flat:
 
     def take(self, gray: GrayImage, png: bytes) -> Seen:
         """Keep a whole picture in hand, where it shows the board."""
-        corners = self.session.corners
         if self.session.views and (gray.shape[1], gray.shape[0]) != self.session.size_px:
             return Seen(None, "size", "Not taken: the picture has another size than those of the camera.")
-        found = None if corners is None else detect(gray, *corners)
+        found, _ = self.session.measured(gray)
         if found is None:
             return Seen(None, "no board", "Not taken: the board is not seen whole.")
-        board = Board(found.columns, found.rows, 1.0)
         shape = (found.rows, found.columns, 2)
+        if self.session.layout is not None:
+            self.png, self.ends, self.chosen = png, [found.pixels.reshape(shape)], 0
+            return Seen(self.ends[0], "taken", "Say where the board's corner (0, 0) lies, and confirm.")
+        board = Board(found.columns, found.rows, 1.0)
         turns = turns_of(found.pixels, board)
         self.png, self.ends = png, [one.reshape(shape) for _, one in turns]
         try:
@@ -106,13 +107,14 @@ class Flat:
             raise BadInputError(f"the side of a square is {1e3 * square:g} mm, expected 0.1 mm to 1 m")
         self.session.square_m = square
         self.first_corner_m, self.angle_rad = (1e-3 * x, 1e-3 * y), float(np.radians(angle))
-        grid = self.ends[self.chosen]
+        grid, layout = self.ends[self.chosen], self.session.layout
+        marked = {"first_corner_px": np.round(grid[0, 0], 1).tolist()}
         return BoardFile(
             corners=[grid.shape[1], grid.shape[0]],
             square_m=square,
             first_corner_m=list(self.first_corner_m),
             angle_rad=self.angle_rad,
-            first_corner_px=np.round(grid[0, 0], 1).tolist(),
+            **(marked if layout is None else {"dictionary": layout.dictionary}),
         )
 
     def shown(self, rig: Rig) -> dict[str, Any]:

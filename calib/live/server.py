@@ -208,9 +208,8 @@ class Live:
             taken = self.session.accept(gray, name, by_hand)
             if isinstance(taken, Seen):
                 return taken
-            assert self.session.corners is not None
             try:
-                self.album.describe(self.session.corners, self.session.square_m)
+                self.album.describe(self.session.board_file())
                 self.album.add(name, png)
             except BadInputError:
                 self.session.drop(name)

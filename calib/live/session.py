@@ -10,22 +10,32 @@ next pose.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 
-from calib.core.arrays import FloatArray, GrayImage
+from calib.core.arrays import BoolArray, FloatArray, GrayImage
 from calib.core.verdict import Verdict
 from calib.stages.camera import checks
 from calib.stages.camera.bundle import poses_with_camera, projection_sigma_px
-from calib.stages.camera.corners import detect, find_size, follow, reduced, resized
+from calib.stages.camera.corners import Detection, detect, find_size, follow, reduced, resized
 from calib.stages.camera.intrinsics import Intrinsics
 from calib.stages.camera.lattice import find_lattices, find_saddles
 from calib.stages.camera.model import Board, Camera, View, pack, project
-from calib.stages.camera.targets import other_board
+from calib.stages.camera.read import BoardFile
+from calib.stages.camera.targets import (
+    Layout,
+    Markers,
+    detect_charuco,
+    find_markers,
+    other_board,
+    recognise,
+    rows_of,
+    sketch_charuco,
+)
 
 _LOOK_PX = 800
 """Largest side of what is searched while the camera runs; larger frames are made smaller for it."""
@@ -53,6 +63,10 @@ _SMALL_SHARE = 0.15
 _UNSEEN_S = 2.0
 """Without a board for so long, then for twice as long each time, another one is looked for: that takes up to
 a second."""
+_RECOGNISED_EVERY = 8
+"""Frames without a board of which one is looked at for markers, which takes up to half a second."""
+_FEWEST = 3
+"""Columns and rows of which a picture of a ChArUco board has to show corners."""
 
 Code = Literal["no board", "dark", "blurred", "alike", "small", "size", "move", "hold", "taken", "enough"]
 
@@ -111,6 +125,8 @@ class Session:
     ----------
     corners : inner corners, columns and rows; None until a frame shows them.
     square_m : side of a square; intrinsics do not depend on it.
+    dictionary : of the markers of a ChArUco board, where it was stated.
+    layout : of a ChArUco board, once a frame shows it; None for a plain board.
     views : by the names of pictures, in the order in which they were taken.
     fit : of the views, as `fitted` brought it. history : one entry for each fit.
     """
@@ -118,6 +134,8 @@ class Session:
     corners: tuple[int, int] | None = None
     square_m: float | None = None
     size_px: tuple[int, int] | None = None
+    dictionary: str | None = None
+    layout: Layout | None = None
     views: dict[str, View] = field(default_factory=dict)
     fit: Intrinsics | None = None
     history: list[Progress] = field(default_factory=list)
@@ -126,6 +144,7 @@ class Session:
     _before: FloatArray | None = None
     _waits: bool = False
     _sized: tuple[int, int] | None = None
+    _unseen: int = 0
     _asked: tuple[float, float] | None = None
     _instead: str = ""
 
@@ -143,7 +162,7 @@ class Session:
         size_px : width and height of the whole picture, where the frame is a copy.
         still : whether the frame is a picture that somebody took already, in whatever pose.
         """
-        found = self.found(gray, size_px)
+        found = self.found(gray, size_px, still)
         if isinstance(found, Seen):
             self._past.clear()
             if found.code == "no board" and (says := self._other(gray, t_s, still)):
@@ -173,7 +192,7 @@ class Session:
         return Seen(grid, "taken", "Good.", take=True, matched=matched)
 
     def found(
-        self, gray: GrayImage, size_px: tuple[int, int] | None = None
+        self, gray: GrayImage, size_px: tuple[int, int] | None = None, still: bool = False
     ) -> tuple[FloatArray, tuple[Code, str] | None] | Seen:
         """Corners (rows, columns, 2) of the board in pixels of the whole picture, and what is wrong with it.
 
@@ -184,20 +203,76 @@ class Session:
             return Seen(None, "size", _other_size(size_px, self.size_px))
         self.size_px = size_px
         small = _reduced(gray)
-        board = None if self._before is None else follow(small, self._before)
-        if board is None and self.corners is not None:
-            board = _grid(small, self.corners)
-        # Until a picture is taken: a hand on the board makes it look smaller.
-        if board is None and not self._size_settled and (size := _size_of(small)):
-            self.corners = self._sized = size
-            board = _grid(small, size)
-        self._before = board
+        scale = size_px[0] / small.shape[1]
+        board, plain = (None, small) if self.dictionary and not self.layout else self._sought_in(small)
+        if board is None and self.layout is None and (still or self.dictionary or self.corners is None):
+            self._unseen += 1
+            if (still or self._unseen % _RECOGNISED_EVERY == 1) and self._recognised(small):
+                board, plain = self._sought_in(small)
         if self.corners is None:
             return Seen(None, "no board", "Hold the whole board into the picture, with light on it.")
-        if board is None:
+        if board is None or not self._shows_enough((board + 0.5) * scale - 0.5):
             return Seen(None, "no board", self._sought())
-        scale = size_px[0] / small.shape[1]
-        return (board + 0.5) * scale - 0.5, self._fault(small, board, scale)
+        self._unseen = 0
+        return (board + 0.5) * scale - 0.5, self._fault(plain, board, scale)
+
+    def _sought_in(self, gray: GrayImage) -> tuple[FloatArray | None, GrayImage]:
+        """Corners of the board in a frame, and the frame without its markers."""
+        if self.layout is not None:
+            markers = self._markers(gray)
+            return sketch_charuco(gray, markers, self.layout) or (None, gray)
+        board = None if self._before is None else follow(gray, self._before)
+        if board is None and self.corners is not None:
+            board = _grid(gray, self.corners)
+        # Until a picture is taken: a hand on the board makes it look smaller.
+        if board is None and not self._size_settled and (size := _size_of(gray)):
+            self.corners = self._sized = size
+            board = _grid(gray, size)
+        self._before = board
+        return board, gray
+
+    def _markers(self, gray: GrayImage) -> Markers:
+        """Those of the layout's dictionary, which may show that the board has more rows than were seen."""
+        assert self.layout is not None
+        markers = find_markers(gray, self.layout.dictionary)
+        if self.corners == self._sized and (rows := rows_of(markers, self.layout)) > self.layout.rows:
+            self._begin(replace(self.layout, rows=rows))
+        return markers
+
+    def _recognised(self, gray: GrayImage) -> bool:
+        """Whether a picture shows the ChArUco board that is stated, or any where nothing says otherwise."""
+        if self.views and not self.dictionary and self.corners is not None:
+            return False
+        layout = recognise([gray], self.dictionary)
+        if layout is None or layout.kind != "charuco" or layout.rows < _FEWEST:
+            return False
+        size = layout.columns - 1, layout.rows - 1
+        if self.corners is not None and self.corners != self._sized:
+            stated = (self.corners, self.corners[::-1])
+            rows = next((one[1] for one in stated if one[0] == size[0] and one[1] >= size[1]), None)
+            if rows is None:
+                return False
+            self.corners, self.layout = (size[0], rows), replace(layout, rows=rows + 1)
+            return True
+        self._begin(layout)
+        return True
+
+    def _begin(self, layout: Layout) -> None:
+        self.layout, self.corners = layout, (layout.columns - 1, layout.rows - 1)
+        self._sized = self.corners
+
+    def _in_picture(self, grid: FloatArray) -> BoolArray:
+        """Which corners (..., 2) are in the picture; of a ChArUco board not all have to be."""
+        return _within(grid, self._size())
+
+    def _shows_enough(self, grid: FloatArray) -> bool:
+        seen = self._in_picture(grid)
+        return min(int(seen.any(axis=0).sum()), int(seen.any(axis=1).sum())) >= _FEWEST
+
+    def _moved(self, a: FloatArray, b: FloatArray) -> float:
+        """Root mean square distance of the corners that both show."""
+        both = self._in_picture(a) & self._in_picture(b)
+        return _apart(a[both], b[both]) if both.sum() > _FEWEST else np.inf
 
     @property
     def _size_settled(self) -> bool:
@@ -214,6 +289,8 @@ class Session:
         return self._instead
 
     def _other_words(self, gray: GrayImage) -> str:
+        if self.layout is None and self._recognised(gray):
+            return ""
         size = _size_of(gray) if self.corners else None
         if size and self.corners and sorted(size) != sorted(self.corners):
             return (
@@ -223,13 +300,19 @@ class Session:
         other = None if size else other_board(gray)
         if other is None:
             return ""
-        more = ", or let calib intrinsics read pictures of it" if "ChArUco" in other else ""
-        return f"The picture shows {other}: show a checkerboard{more}."
+        wanted = "a checkerboard or a ChArUco board"
+        if self.views:
+            wanted = "the one of the pictures so far"
+        elif self.corners:
+            wanted = f"one of {self.corners[0]}x{self.corners[1]} inner corners"
+        more = ", or begin a new folder" if "ChArUco" in other else ""
+        return f"The picture shows {other}: show {wanted}{more}."
 
     def _sought(self) -> str:
         assert self.corners is not None
         columns, rows = self.corners
-        return f"Show the whole board of {columns}x{rows} inner corners. {self.ghost().says}"
+        board = "the whole board" if self.layout is None else "more of the ChArUco board"
+        return f"Show {board} of {columns}x{rows} inner corners. {self.ghost().says}"
 
     def _holds_still(self, grid: FloatArray, t_s: float) -> bool:
         width = self._size()[0]
@@ -237,7 +320,7 @@ class Session:
         while len(self._past) > 2 and self._past[1][0] <= t_s - _STILL_S:
             self._past.popleft()
         long = t_s - self._past[0][0] >= _STILL_S
-        return long and all(_apart(grid, one) < _STILL_SHARE * width for _, one in self._past)
+        return long and all(self._moved(grid, one) < _STILL_SHARE * width for _, one in self._past)
 
     def _fault(self, gray: GrayImage, grid: FloatArray, scale: float) -> tuple[Code, str] | None:
         """Why a picture is not worth taking."""
@@ -254,12 +337,15 @@ class Session:
     def _alike(self, grid: FloatArray) -> str | None:
         """Name of an earlier picture that shows the board in the same place."""
         limit = _ALIKE_SHARE * self._size()[0]
-        turns = [turned for k in range(4) if (turned := np.rot90(grid, k)).shape == grid.shape]
+        ends = range(4 if self.layout is None else 1)
+        turns = [turned for k in ends if (turned := np.rot90(grid, k)).shape == grid.shape]
         for name, view in self.views.items():
-            if view.pixels.size == grid.size:
-                other = view.pixels.reshape(grid.shape)
-                if min(_apart(turned, other) for turned in turns) < limit:
-                    return name
+            # Of a ChArUco board earlier pictures may have shown fewer rows.
+            other = view.pixels[: grid.size // 2]
+            if self.layout is None and other.size != grid.size:
+                continue
+            if min(self._moved(one.reshape(-1, 2)[: len(other)], other) for one in turns) < limit:
+                return name
         return None
 
     # ------------------------------------------------------------------
@@ -273,16 +359,16 @@ class Session:
         size_px = (gray.shape[1], gray.shape[0])
         if self.views and size_px != self._size():
             return Seen(None, "size", _other_size(size_px, self._size()))
-        if self.corners is None:
+        if self.corners is None and not self.dictionary:
             self.corners = self._sized = find_size(gray, within=True)
-        if self.corners is None:
-            return Seen(None, "no board", "Not taken: no board is seen whole.")
-        self.size_px = size_px
-        found = detect(gray, *self.corners)
+        found, plain = self.measured(gray)
+        if found is None and self.layout is None and self._recognised(gray):
+            found, plain = self.measured(gray)
         if found is None:
             return Seen(None, "no board", "Not taken: the board is not seen whole.")
+        self.size_px = size_px
         grid = found.pixels.reshape(found.rows, found.columns, 2)
-        fault = self._fault(gray, grid, 1.0)
+        fault = self._fault(plain, grid, 1.0)
         if fault is not None and not by_hand:
             return Seen(grid, *fault)
         if not by_hand and (other := self._alike(grid)):
@@ -292,6 +378,16 @@ class Session:
         self._past.clear()
         self._waits = True
         return view
+
+    def measured(self, gray: GrayImage) -> tuple[Detection | None, GrayImage]:
+        """The board in a whole picture, and the picture without its markers."""
+        if self.layout is not None:
+            markers = self._markers(gray)
+            sketched = sketch_charuco(gray, markers, self.layout)
+            return detect_charuco(gray, markers, self.layout), gray if sketched is None else sketched[1]
+        if self.corners is None or self.dictionary:
+            return None, gray
+        return detect(gray, *self.corners), gray
 
     def drop(self, name: str) -> View | None:
         """Leave a picture out."""
@@ -328,6 +424,15 @@ class Session:
     def gain(self) -> float | None:
         """Share by which the best next picture would lower the uncertainty; None before there is a fit."""
         return None if self._plan is None else 1.0 - self._plan.best.remaining
+
+    def board_file(self) -> BoardFile:
+        """What is known of the board. Markers tell its size, of which the pictures may not show all yet."""
+        stated: dict[str, Any] = {} if self.square_m is None else {"square_m": self.square_m}
+        if self.layout is not None:
+            stated["dictionary"] = self.layout.dictionary
+        if self.corners is not None and (self.layout is None or self.corners != self._sized):
+            stated = {"corners": list(self.corners)} | stated
+        return BoardFile(**stated)
 
     # ------------------------------------------------------------------
     # The next pose.
@@ -388,7 +493,9 @@ class Session:
         """Rotation and the position of the board's middle."""
         target = self._board().points_m()
         target = target - 0.5 * target.max(axis=0)
-        seen = poses_with_camera(self._nominal(), pack([View("", target, grid.reshape(-1, 2))]))
+        pixels = grid.reshape(-1, 2)
+        shown = self._in_picture(pixels)
+        seen = poses_with_camera(self._nominal(), pack([View("", target, pixels, shown)]))
         return (seen.R_CT[0], seen.t_CT_m[0]) if seen.posed.all() else None
 
     def _near(self, grid: FloatArray, ghost: Ghost) -> float:
@@ -508,12 +615,16 @@ def edges(gray: GrayImage, grid: FloatArray) -> tuple[float, float]:
 
     Parameters
     ----------
-    grid : (rows, columns, 2) corners.
+    grid : (rows, columns, 2) corners; those beyond the picture do not count.
     """
     blur_px, contrast = 0.0, np.inf
-    for a, b in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
-        along = (b - a).reshape(-1, 2)
-        middle = (0.5 * (a + b)).reshape(-1, 2)
+    seen = _within(grid, gray.shape[::-1])
+    for before, after in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        both = seen[before] & seen[after]
+        if not both.any():
+            continue
+        a, b = grid[before][both], grid[after][both]
+        along, middle = b - a, 0.5 * (a + b)
         length = np.linalg.norm(along, axis=1)
         across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(length, 1e-9)[:, None]
         at = np.linspace(-0.4, 0.4, 41) * float(np.median(length))
@@ -526,6 +637,11 @@ def edges(gray: GrayImage, grid: FloatArray) -> tuple[float, float]:
         blur_px = max(blur_px, float(np.median(step / np.maximum(slope, 1e-9))) / float(np.sqrt(2 * np.pi)))
         contrast = min(contrast, 0.5 * float(np.median(step)))
     return blur_px, contrast
+
+
+def _within(points: FloatArray, size_px: Sequence[int]) -> BoolArray:
+    """Which points (..., 2) are in a picture of this width and height."""
+    return np.asarray(((points > -0.5) & (points < np.array(size_px) - 0.5)).all(axis=-1))
 
 
 def _grid(gray: GrayImage, corners: tuple[int, int]) -> FloatArray | None:

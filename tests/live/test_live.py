@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,30 +23,35 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+from boards import CAMERA as MARKED_CAMERA
 from boards import charuco
+from boards import render as marked
 from chromium import browser_or_skip
-from liveboards import BOARD, CAMERA, Person, follow, random_poses, write_y4m
+from liveboards import BOARD, CAMERA, Person, about, follow, random_poses, write_y4m
 from markervideos import Scene
 from sentframes import encoded
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from calib.cli.main import main
+from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError
 from calib.core.geometry import box_grid
 from calib.io.logs import read_log
 from calib.io.serial import Frame, Inputs, Outputs
 from calib.live.album import Album
 from calib.live.marker import Marker
+from calib.live.plane import Flat
 from calib.live.server import MOST_BYTES, Live
 from calib.live.session import ENOUGH, Seen, Session, edges
 from calib.live.sources import MOST_PIXELS, Source, Watched, source_of
 from calib.stages.camera.bundle import calibrate, covariance, projection_sigma_px
+from calib.stages.camera.checks import tilted
 from calib.stages.camera.intrinsics import calibrate_camera
-from calib.stages.camera.model import View, pack
+from calib.stages.camera.model import Board, Camera, View, pack
 from calib.stages.camera.options import Told
 from calib.stages.camera.read import BoardFile
-from calib.twin.scene import Light, PrintedBoard, Sensor, corner_pixels, pose_facing, render
+from calib.twin.scene import Light, Pose, PrintedBoard, Sensor, corner_pixels, pose_facing, render
 
 PATIENCE_S = 300.0
 """Each wait ends with what it waits for; on a busy machine that may be late."""
@@ -162,14 +168,102 @@ def test_a_board_that_comes_in_from_the_side_is_not_taken_for_a_smaller_one() ->
 def test_what_else_is_held_into_the_picture_is_named() -> None:
     drawing = charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75).image
     picture = cv2.resize(np.pad(drawing, 96, constant_values=255), (400, 320), interpolation=cv2.INTER_AREA)
-    live = Session()
-    assert [live.look(picture, t_s).says[:28] for t_s in (0.0, 1.0)] == ["Hold the whole board into th"] * 2
-    assert "shows a ChArUco board: show a checkerboard, or let calib intr" in live.look(picture, 3.0).says
+    live = Session(corners=(9, 6))
+    assert [live.look(picture, t_s).says[:28] for t_s in (0.0, 1.0)] == ["Show the whole board of 9x6 "] * 2
+    assert "shows a ChArUco board: show one of 9x6 inner corners, or" in live.look(picture, 3.0).says
     person = Person(np.random.default_rng(0))
     other = Session(corners=(9, 6), size_px=CAMERA.image_size_px)
     whole = person.frame(person.pose_at(session().ghost()))
     assert "whole board of 9x6 inner corners" in other.look(whole, 0.0).says
     assert "A board of 8x5 inner corners is seen, expected 9x6: show" in other.look(whole, 3.0).says
+
+
+MARKED = charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75)
+
+
+@dataclass
+class Holder(Person):
+    """A person with a ChArUco board."""
+
+    camera: Camera = MARKED_CAMERA
+    board: Board = field(default_factory=lambda: Board(7, 5, 1.0))
+
+    def frame(self, pose: Pose, *_: Any) -> GrayImage:  # type: ignore[override]
+        self.seed += 2
+        return marked(MARKED, pose.R_CB, pose.t_m - pose.R_CB @ [1.0, 1.0, 0.0], seed=self.seed)
+
+
+def test_a_charuco_board_leads_as_well_and_a_part_of_it_is_enough(tmp_path: Path) -> None:
+    live, person = Session(), Holder(np.random.default_rng(0))
+    width, height = MARKED_CAMERA.image_size_px
+    whole = person.frame(about(tilted(20.0, "top"), np.array([0.0, 0.0, 9.0]), person.board))
+    # Rows that no picture has shown yet are not known of.
+    part = np.full_like(whole, 90)
+    part[height // 2 - 100 :] = whole[: height // 2 + 100]
+    assert live.look(part, 0.0).corners_px is not None and live.corners is not None
+    assert live.corners[0] == 7 and live.corners[1] in (3, 4)
+    first = live.accept(part, "a.png", by_hand=True)
+    assert isinstance(first, View) and first.measured is not None
+    assert live.board_file() == BoardFile(dictionary="4X4_50")
+    assert live.look(part, 0.1).code == "alike"
+    assert live.look(whole, 0.2).code == "move"
+    second = live.accept(whole, "b.png")
+    assert live.corners == (7, 5) and isinstance(second, View) and second.measured is not None
+    assert second.measured.all()
+    again = live.accept(part, "c.png")
+    assert isinstance(again, Seen) and again.says == "Too like a.png."
+    # Beyond the left border two columns lie.
+    left = np.roll(whole, -int(np.sort(second.pixels[:, 0])[12]), axis=1)
+    left[:, width - int(np.sort(second.pixels[:, 0])[12]) :] = 90
+    seen = live.look(left, 0.3)
+    assert seen.corners_px is not None and not ((seen.corners_px > 0).all())
+    third = live.accept(left, "c.png", by_hand=True)
+    assert isinstance(third, View) and third.measured is not None and 15 <= third.measured.sum() < 30
+    blurred = np.asarray(cv2.GaussianBlur(whole, (0, 0), 3.0))
+    assert live.look(blurred, 0.4).code in ("blurred", "no board")
+    # In the plane its markers say which corner is (0, 0).
+    live.square_m, flat = 0.02, Flat(live)
+    assert flat.look(whole).code == "hold" and flat.take(whole, png(whole)).code == "taken"
+    assert (len(flat.ends), flat.chosen) == (1, 0)
+    assert flat.place({"x_mm": 10, "y_mm": 0, "angle_deg": 0}) == BoardFile(
+        corners=[7, 5], square_m=0.02, dictionary="4X4_50", first_corner_m=[0.01, 0.0], angle_rad=0.0
+    )
+    # What it has saved is read as it was seen.
+    album = Album(tmp_path)
+    album.open(Told())
+    album.describe(live.board_file())
+    assert (album.images / "board.yaml").read_text() == "square_m: 0.02\ndictionary: 4X4_50\n"
+    for name, one in (("a.png", part), ("b.png", whole), ("c.png", left)):
+        album.add(name, png(one))
+    board, views, size_px = album.open(Told())
+    assert (board, size_px) == (BoardFile(square_m=0.02, dictionary="4X4_50"), (width, height))
+    # Of the first the corners under its last markers count too, now that they are known to be some.
+    counts = [int(np.sum(one.measured)) for one in views]
+    assert counts == [28, second.measured.sum(), third.measured.sum()]
+    on = Session(None, board.square_m, size_px, board.dictionary)
+    on.views.update((one.name, one) for one in views)
+    assert on.look(whole, 0.0).code == "alike" and on.corners == (7, 5)
+
+
+def test_a_charuco_board_of_a_stated_size_has_it() -> None:
+    person = Holder(np.random.default_rng(0))
+    whole = person.frame(about(tilted(20.0, "top"), np.array([0.0, 0.0, 9.0]), person.board))
+    live = Session(corners=(7, 9))
+    assert live.look(whole, 0.0, still=True).corners_px is not None
+    assert live.corners == (7, 9) and live.board_file().corners == [7, 9]
+    other = Session(corners=(9, 6))
+    assert "shows a ChArUco board: show one of 9x6" in other.look(whole, 0.0, still=True).says
+
+
+@pytest.mark.slow
+def test_a_charuco_board_from_the_first_frame_to_enough() -> None:
+    live, person = Session(), Holder(np.random.default_rng(1))
+    live.look(person.frame(next(random_poses(person.rng, person.camera, person.board))), -5.0)
+    poses = follow(live, person)
+    assert 8 <= len(poses) <= 25 and live.fit is not None and live.fit.verdict.ok
+    found, sigma = live.fit.calibration.camera, live.fit.covariance.sigma()
+    for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        assert abs(getattr(found, name) - getattr(MARKED_CAMERA, name)) < 4 * sigma[name], name
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4000), (4000, 1), (3, 4000)])
@@ -254,7 +348,7 @@ def test_pictures_are_never_written_over_and_an_earlier_session_goes_on(
     names = sorted(path.name for path in (project_root / "images").glob("view*.png"))[:5]
     for name in names:
         shutil.copy(project_root / "images" / name, album.images)
-    album.describe((7, 5), 0.02)
+    album.describe(BoardFile(corners=[7, 5], square_m=0.02))
     with pytest.raises(BadInputError, match="is there, and is not a picture"):
         album.add(names[0], b"\x89PNG")
     assert album.drop(names[4]) and album.left_out() == [names[4]] and album.new_name() == "view006.png"
