@@ -586,13 +586,26 @@ def drift(calibration: bundle.Calibration) -> FloatArray | None:
     """RMS change (P,) of the intrinsics about their mean, where they run evenly from view to view; else None.
 
     As of a lens that warms up, or one refocused by too little to tell two cameras apart. The target keeps one
-    shape, which is estimated along.
+    shape, which is estimated along. A change of which some view alone is the evidence is none.
     """
-    views, P = calibration.observations.views, len(calibration.free)
+    views = calibration.observations.views
     if views < _LEAST_IN_ALL:
         return None
     found = evidence(calibration, _basis(calibration)[0], DEFORMATIONS)
     t = np.linspace(-1.0, 1.0, views)
+    step, certain = _step(found, t)
+    if not certain or not all(_step(found, t, np.arange(views) != i)[1] for i in range(views)):
+        return None
+    return step / math.sqrt(3.0)
+
+
+def _step(found: Evidence, t: FloatArray, kept: BoolArray | None = None) -> tuple[FloatArray, bool]:
+    """Change (P,) of the intrinsics for one unit of t (N,), and whether some of it is certain."""
+    if kept is not None:
+        S, b = found.S[kept], found.b[kept]
+        found = replace(found, S=S, b=b, cost=found.cost[kept], measured=found.measured[kept])
+        t = t[kept]
+    P = found.intrinsics
     late, later = np.einsum("n,ngh->gh", t, found.S)[:, :P], np.einsum("n,ngh->gh", t**2, found.S)[:P, :P]
     S = np.block([[found.S.sum(axis=0), late], [late.T, later]])
     b = np.concatenate([found.b.sum(axis=0), t @ found.b[:, :P]])
@@ -602,9 +615,10 @@ def drift(calibration: bundle.Calibration) -> FloatArray | None:
     moved = common + t[:, None] * np.concatenate([step, np.zeros(len(common) - P)])
     # Scatter of the views about what they run along.
     about = replace(found, b=found.b + np.einsum("ngh,nh->ng", found.S, moved))
-    left = max(calibration.squared_sum - float(gain(S, b)), 0.0) / max(calibration.degrees_of_freedom - P, 1)
+    freedom = int((found.measured - 6).sum()) - 2 * P
+    left = max(float(found.cost.sum()) - float(gain(S, b)), 0.0) / max(freedom, 1)
     sigma = np.sqrt(np.maximum(np.diag(inverse)[-P:], 0.0) * left) * overdispersion(about)
-    return step / math.sqrt(3.0) if bool(np.any(np.abs(step) > _CERTAIN * sigma)) else None
+    return step, bool(np.any(np.abs(step) > _CERTAIN * sigma))
 
 
 _TELL_SHAPE = 4
