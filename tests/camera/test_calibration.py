@@ -29,6 +29,7 @@ from calib.stages.camera.checks import (
     DEFORMATIONS,
     TargetShape,
     best_of_starts,
+    by_the_views,
     conditioned,
     evidence,
     overdispersion,
@@ -684,6 +685,19 @@ def test_bow_is_measured(bow_m: float) -> None:
     assert found.bow_m == pytest.approx(abs(bow_m), rel=0.15)
     assert found.bow_significance > 4
     assert found.size_m == pytest.approx(0.12)
+
+
+def test_sigma_allows_for_squares_that_are_hardly_told_from_square_ones() -> None:
+    """Printed .3 % lower, they move fy by six deviations where boards are hardly turned in their plane."""
+    camera, away = camera_of(), []
+    for seed in range(12):
+        views = take(
+            np.random.default_rng(seed), camera, 15, recipe=Recipe(0.08, aspect=0.997, roll_deg=20.0)
+        )
+        fit = calibrate(pack(views), camera.image_size_px, "radial2")
+        sigma = by_the_views(fit).sigma()
+        away += [abs(getattr(fit.camera, n) - getattr(camera, n)) / sigma[n] for n in ("fx_px", "fy_px")]
+    assert max(away) < 3.0
 
 
 # ----------------------------------------------------------------------

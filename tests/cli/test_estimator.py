@@ -177,6 +177,23 @@ def test_an_hour_of_jump_splits_the_log(calib: Run, logs: dict[str, Log], rig: P
     assert section.time_offset_s == pytest.approx(0.025, abs=1e-3)
 
 
+@pytest.mark.parametrize("of_all", [True, False])
+def test_dropouts_of_the_recorder_split_the_log(
+    of_all: bool, calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path
+) -> None:
+    """The angle is not known over .7 s; drawn straight there it made the time offset .25 s."""
+    log = logs["swing"]
+    lost = (log.t_s > 1.5) & (log.t_s < 2.2)
+    lacking = [n for n in log.columns if n[0] in "ag" or (of_all and n in ("u_px", "v_px"))]
+    changed = {n: np.where(lost, np.nan, log.columns[n]) for n in lacking}
+    done = calib("align", _put(tmp_path, "log", log, **changed), "--rig", rig)
+    assert done.code in (0, 1)
+    assert "split at 1 gap(s) of the gyroscope" in done.out
+    section = Rig.load(rig).align
+    assert section is not None
+    assert section.time_offset_s == pytest.approx(0.025, abs=1e-3)
+
+
 def test_pictures_of_something_else(calib: Run, logs: dict[str, Log], rig: Path, tmp_path: Path) -> None:
     log, rng = logs["swing"], np.random.default_rng(0)
     seen = np.isfinite(log.columns["u_px"])

@@ -661,7 +661,7 @@ def _of_target(found: checks.TargetShape | None, calibration: bundle.Calibration
     """Squares that are square, on a board that is flat."""
     if found is None:
         return
-    off, allowed = abs(found.aspect), "; sigma allows for it" if found.certain else ""
+    off, allowed = abs(found.aspect), "; sigma allows for it" if found.allowed else ""
     squares = (
         f"the board's squares are {1 + found.aspect:.3f} times as high as wide "
         f"(standard deviation {found.aspect_sigma:.3f})"
