@@ -410,6 +410,7 @@ def test_files_are_the_same_bytes_again(tmp_path: Path) -> None:
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(first, again, strict=True))
 
 
+@pytest.mark.few(0, 3, 4, 7, 9, 11, 12)
 @pytest.mark.parametrize(
     ("name", "stem", "words"),
     [
