@@ -17,7 +17,15 @@ from calib.stages.estimator.consistency import SENSORS, Tally
 from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import FLAGS, OUT
 from calib.stages.estimator.read import READINGS
-from calib.stages.estimator.replay import Estimate, consistent, contradicting, jumped, sampled, untimely
+from calib.stages.estimator.replay import (
+    Estimate,
+    consistent,
+    contradicting,
+    jumped,
+    leaning,
+    sampled,
+    untimely,
+)
 
 _LAST_PIXEL = {"u_px": 315.0, "v_px": 207.0}
 _UNIT = {"u_px": 0.5, "v_px": 0.5, "ax_mps2": 1 / 9.81, "ay_mps2": 1 / 9.81, "gz_radps": 57.3}
@@ -140,6 +148,24 @@ def test_a_late_column_is_named(scenario: str, late: tuple[str, ...], samples: i
     (finding,) = untimely(setup, rows_from(_delayed(log, late, samples)))
     assert finding.severity == "inconsistent"
     assert told in finding.text
+
+
+@pytest.mark.parametrize(
+    ("scenario", "far_px"),
+    [("static", 2.0), ("swing", 0.0), ("ellipse", 2.0), ("step", 4.0), ("elongation", 4.0)],
+)
+def test_an_angle_that_gravity_contradicts_is_told(scenario: str, far_px: float) -> None:
+    """Pictures two pixels aside, as of a camera that was moved: the angle is 2 degrees off. It takes more
+    in 10 s than in 20, and a swing is too short to tell.
+    """
+    _, log = driven_log(scenario)
+    setup = setup_for(varied_drive(0))
+    for aside_px in (0.0, far_px):
+        moved = replace(log, columns={**log.columns, "u_px": log.columns["u_px"] + aside_px})
+        tally = Tally(0.0126)
+        tally.add(Estimate(setup, Drive(), "auto")(rows_from(moved), moved))
+        told = [one.text for one in leaning(setup, tally)]
+        assert bool(told) == (aside_px > 0.0), told
 
 
 def test_a_clock_that_steps_midway_is_named() -> None:
