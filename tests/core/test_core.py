@@ -355,6 +355,26 @@ def test_of_two_processes_that_need_a_function_one_compiles_it(tmp_path: Path) -
     assert not list(tmp_path.rglob("*.lock"))
 
 
+def test_sets_of_numbas_options_are_alike_as_before() -> None:
+    from numba.core.compiler import Flags
+
+    def flags(**values: bool) -> Flags:
+        made = Flags()
+        for name, value in values.items():
+            setattr(made, name, value)
+        return made
+
+    # nrt is off by itself.
+    alike = [flags(), flags(nrt=False)], [flags(no_cfunc_wrapper=True), flags(no_cfunc_wrapper=True)]
+    assert all(a == b and hash(a) == hash(b) for a, b in alike)
+    assert flags(nrt=True) not in [
+        flags(),
+        flags(no_cfunc_wrapper=True),
+        flags(nrt=True, no_cfunc_wrapper=True),
+        None,
+    ]
+
+
 def test_constants_in_calls_are_compiled_once() -> None:
     program = (
         "from calib.core.compilation import kernel\n"
