@@ -255,9 +255,12 @@ def recognise(pictures: Sequence[GrayImage], dictionary: str | None = None) -> L
                 break
             if ids is None or len(ids) < _FEWEST_MARKERS:
                 continue
-            if _layout_of([_markers(quads, ids)], name) is None:
+            seen = _markers(quads, ids)
+            layout = _layout_of([seen], name)
+            if layout is None:
                 continue
-            return _layout_of([find_markers(one, name, border) for one in small], name)
+            more = [find_markers(one, name, border) for one in small if one is not gray]
+            return _layout_of([seen, *more], name) if more else layout
     return None
 
 
