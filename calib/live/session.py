@@ -31,10 +31,11 @@ from calib.stages.camera.targets import (
     Markers,
     detect_charuco,
     find_markers,
+    in_place,
     other_board,
     recognise,
-    rows_of,
     sketch_charuco,
+    with_rows,
 )
 
 _LOOK_PX = 800
@@ -235,8 +236,9 @@ class Session:
         """Those of the layout's dictionary, which may show that the board has more rows than were seen."""
         assert self.layout is not None
         markers = find_markers(gray, self.layout.dictionary)
-        if self.corners == self._sized and (rows := rows_of(markers, self.layout)) > self.layout.rows:
-            self._begin(replace(self.layout, rows=rows))
+        grown = with_rows(self.layout, [in_place(markers, self.layout)[0].ids])
+        if self.corners == self._sized and grown is not None and grown.rows > self.layout.rows:
+            self._begin(grown)
         return markers
 
     def _recognised(self, gray: GrayImage) -> bool:

@@ -229,12 +229,6 @@ def with_rows(layout: Layout, ids: Sequence[IntArray]) -> Layout | None:
     return replace(layout, dictionary=dictionary, rows=rows)
 
 
-def rows_of(markers: Markers, layout: Layout) -> int:
-    """How many rows of squares a board has at least that shows these markers."""
-    ids = in_place(markers, layout)[0].ids
-    return int(layout.places(ids)[:, 1].max()) + 1 if len(ids) >= _FEWEST_MARKERS else 0
-
-
 def _reduced(gray: GrayImage, pixels: int) -> GrayImage:
     """The picture averaged down to about so many pixels."""
     zoom = np.sqrt(pixels / gray.size)
