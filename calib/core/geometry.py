@@ -46,8 +46,8 @@ def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> Floa
 
 
 def in_picture(pixels: FloatArray, image_size_px: tuple[int, int]) -> BoolArray:
-    """Whether pixels (n, 2) are known and lie in a picture of this width and height, edges included, (n,)."""
-    return np.asarray(((pixels >= -0.5) & (pixels <= np.array(image_size_px) - 0.5)).all(axis=1))
+    """Whether pixels (..., 2) are known and lie in a picture of this width and height, edges included."""
+    return np.asarray(((pixels >= -0.5) & (pixels <= np.array(image_size_px) - 0.5)).all(axis=-1))
 
 
 def apply_homography(H: FloatArray, points: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ next pose.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, GrayImage
+from calib.core.geometry import in_picture
 from calib.core.verdict import Verdict
 from calib.stages.camera import checks
 from calib.stages.camera.bundle import poses_with_camera, projection_sigma_px
@@ -32,6 +33,7 @@ from calib.stages.camera.targets import (
     detect_charuco,
     find_markers,
     in_place,
+    of_size,
     other_board,
     recognise,
     sketch_charuco,
@@ -248,14 +250,11 @@ class Session:
         layout = recognise([gray], self.dictionary)
         if layout is None or layout.kind != "charuco" or layout.rows < _FEWEST:
             return False
-        size = layout.columns - 1, layout.rows - 1
         if self.corners is not None and self.corners != self._sized:
-            stated = (self.corners, self.corners[::-1])
-            rows = next((one[1] for one in stated if one[0] == size[0] and one[1] >= size[1]), None)
-            if rows is None:
-                return False
-            self.corners, self.layout = (size[0], rows), replace(layout, rows=rows + 1)
-            return True
+            self.layout = of_size(layout, self.corners)
+            if self.layout is not None:
+                self.corners = self.layout.columns - 1, self.layout.rows - 1
+            return self.layout is not None
         self._begin(layout)
         return True
 
@@ -265,7 +264,7 @@ class Session:
 
     def _in_picture(self, grid: FloatArray) -> BoolArray:
         """Which corners (..., 2) are in the picture; of a ChArUco board not all have to be."""
-        return _within(grid, self._size())
+        return in_picture(grid, self._size())
 
     def _shows_enough(self, grid: FloatArray) -> bool:
         seen = self._in_picture(grid)
@@ -620,7 +619,7 @@ def edges(gray: GrayImage, grid: FloatArray) -> tuple[float, float]:
     grid : (rows, columns, 2) corners; those beyond the picture do not count.
     """
     blur_px, contrast = 0.0, np.inf
-    seen = _within(grid, gray.shape[::-1])
+    seen = in_picture(grid, (gray.shape[1], gray.shape[0]))
     for before, after in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         both = seen[before] & seen[after]
         if not both.any():
@@ -639,11 +638,6 @@ def edges(gray: GrayImage, grid: FloatArray) -> tuple[float, float]:
         blur_px = max(blur_px, float(np.median(step / np.maximum(slope, 1e-9))) / float(np.sqrt(2 * np.pi)))
         contrast = min(contrast, 0.5 * float(np.median(step)))
     return blur_px, contrast
-
-
-def _within(points: FloatArray, size_px: Sequence[int]) -> BoolArray:
-    """Which points (..., 2) are in a picture of this width and height."""
-    return np.asarray(((points > -0.5) & (points < np.array(size_px) - 0.5)).all(axis=-1))
 
 
 def _grid(gray: GrayImage, corners: tuple[int, int]) -> FloatArray | None:

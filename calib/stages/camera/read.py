@@ -424,7 +424,10 @@ class _Search:
         kept = [targets.in_place(one, layout)[0].ids for one in markers.values()]
         layout = targets.with_rows(layout, kept) or layout
         if corners is not None:
-            layout = self._as_stated(corners, layout)
+            size, stated = (layout.columns - 1, layout.rows - 1), targets.of_size(layout, corners)
+            if stated is None:
+                raise BadInputError(_not_found(pictures, corners, size, "a ChArUco board"))
+            layout = stated
         board = Board(layout.columns - 1, layout.rows - 1, self.square_m)
         found = dict.fromkeys(every) | self._counted(
             list(markers), [(targets.detect_charuco, i, (one, layout)) for i, one in markers.items()]
@@ -435,14 +438,6 @@ class _Search:
                 f"({layout.dictionary}, {board.columns}x{board.rows} inner corners)"
             )
         return self._search(board, found, layout)
-
-    def _as_stated(self, corners: tuple[int, int], layout: targets.Layout) -> targets.Layout:
-        """The layout with as many rows as stated, of which some may never have been seen."""
-        columns, rows = layout.columns - 1, layout.rows - 1
-        stated = next((c for c in (corners, corners[::-1]) if c[0] == columns and c[1] >= rows), None)
-        if stated is None:
-            raise BadInputError(_not_found(self.pictures, corners, (columns, rows), "a ChArUco board"))
-        return replace(layout, rows=stated[1] + 1)
 
     def _are_large(self, found: Mapping[int, Detection | None]) -> bool:
         """Whether a board is large enough to be meant: texture as small as a stamp passes for any."""

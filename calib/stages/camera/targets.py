@@ -229,6 +229,13 @@ def with_rows(layout: Layout, ids: Sequence[IntArray]) -> Layout | None:
     return replace(layout, dictionary=dictionary, rows=rows)
 
 
+def of_size(layout: Layout, corners: tuple[int, int]) -> Layout | None:
+    """The layout with as many rows as stated, of which some may not be seen yet; None for another board."""
+    columns, rows = layout.columns - 1, layout.rows - 1
+    stated = next((c for c in (corners, corners[::-1]) if c[0] == columns and c[1] >= rows), None)
+    return None if stated is None else replace(layout, rows=stated[1] + 1)
+
+
 def _reduced(gray: GrayImage, pixels: int) -> GrayImage:
     """The picture averaged down to about so many pixels."""
     zoom = np.sqrt(pixels / gray.size)
