@@ -32,7 +32,7 @@ from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import cv2
@@ -55,6 +55,7 @@ _FEWEST_TO_FORK = 4
 _PR_SET_PDEATHSIG = 1
 
 _most: list[int] = []
+_starting = threading.Lock()
 _leaving: set[int] = set()
 """Threads of ours, by the system's numbers, that may still be there."""
 
@@ -223,7 +224,7 @@ class Pool:
         channel, theirs = context.Pipe()
         words = (theirs, os.getpid(), self._begin, ahead)
         process: BaseProcess = context.Process(target=_serve, args=words, daemon=self._forked)
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), contextlib.nullcontext() if self._forked else _no_script():
             # Python 3.12 counts the idle threads of a BLAS library, which survive a fork.
             warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
             process.start()
@@ -255,6 +256,17 @@ class Pool:
                 else:
                     ended.append((task, result))
         yield from ended
+
+
+@contextlib.contextmanager
+def _no_script() -> Iterator[None]:
+    """Hide the script that runs: a process that is spawned would run it again before its first task."""
+    with _starting:
+        script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
 
 
 def _received(channel: Connection) -> Any:

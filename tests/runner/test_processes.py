@@ -70,11 +70,12 @@ def test_one_task_takes_no_other_with_it(tmp_path: Path) -> None:
 _PARENT = """
 import os, sys, pool_tasks
 from calib.core.workers import Pool, Task
-if __name__ == "__main__":
-    with Pool(1) as pool:
-        pool.start(Task("child", pool_tasks.tell, (sys.argv[1],)))
-        list(pool.finished())
+with Pool(1) as pool:
+    pool.start(Task("child", pool_tasks.tell, (sys.argv[1],)))
+    list(pool.finished())
+open(sys.argv[1], "w").close()
 """
+"""A script as people write them: the child must not run it again."""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a process ends with its task")
