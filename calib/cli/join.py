@@ -59,7 +59,7 @@ def join(
     log, clocks, outside = joined(marker, read_log(board, stated, remarks), known, shown(rig), given)
     for remark in remarks:
         narrate(remark)
-    write_log(output, log)
+    write_log(output, log, LOG)
     told: dict[str, Any] = {"log": shown(output), "rows": len(log), "outside": outside}
     lines = [f"{len(log)} rows written to {shown(output)}: t_s, {', '.join(log.columns)}"]
     if clocks is not None:

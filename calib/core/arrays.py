@@ -8,6 +8,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from calib.core.errors import UsageError
+
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
@@ -25,6 +27,20 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
 def blocks(values: FloatArray, size: int) -> FloatArray:
     """Values (n, ...) in whole blocks (n // size, size, ...); what is left at the end is left out."""
     return values[: len(values) // size * size].reshape(-1, size, *values.shape[1:])
+
+
+def points_of(values: npt.ArrayLike, size: int) -> FloatArray:
+    """Points (n, size) from those of a caller (..., size), as lists or numbers of any kind.
+
+    Raises `UsageError` for another shape: rows and columns that are exchanged would be other points.
+    """
+    try:
+        found = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"found no table of numbers, expected points (n, {size})") from None
+    if found.size and found.shape[-1:] != (size,):
+        raise UsageError(f"found numbers of shape {found.shape}, expected points (n, {size})")
+    return found.reshape(-1, size)
 
 
 def integral(t: FloatArray, values: FloatArray) -> FloatArray:

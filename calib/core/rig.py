@@ -25,7 +25,7 @@ import yaml
 from pydantic import BaseModel, Field, field_validator
 
 from calib.core import __version__
-from calib.core.errors import BadInputError, NoSectionError
+from calib.core.errors import BadInputError, NoSectionError, UsageError
 from calib.core.files import one_line, quoted, read_yaml_mapping, sha256, shown
 from calib.core.result import Result, Section, identity, section_json
 from calib.core.schema import nearest, validated
@@ -162,6 +162,16 @@ class Rig:
     twin: Twin | None = None
     provenance: Provenance = field(default_factory=Provenance)
     schema: int = field(default=SCHEMA, compare=False)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Raises `UsageError` for what would not be in the file, or could not be read from it again."""
+        if name != "schema" and name not in KINDS:
+            raise UsageError(f"rig.{name}: there is no such section{nearest(name, KINDS)}")
+        kinds = [f"{one.__module__}.{one.__name__}" for one in type(value).__mro__]
+        if name != "schema" and value is not None and KINDS[name] not in kinds:
+            expected = KINDS[name].rpartition(".")[2]
+            raise UsageError(f"rig.{name}: found a value of type {type(value).__name__}, expected {expected}")
+        object.__setattr__(self, name, value)
 
     @staticmethod
     def load(path: Path | str, missing_ok: bool = False) -> Rig:
@@ -324,6 +334,7 @@ class Rig:
         """What differs in a later calibration, in standard deviations and on the plane."""
         from calib.core.diff import compared, plane_change
 
+        check_rig(other)
         plane = None
         # Pictures of two sizes have no pixels in common.
         alike = self.picture_px == other.picture_px
@@ -489,6 +500,14 @@ class Rig:
         ]
         no_better = [f"{', '.join(poor)}; what follows from it is no better"] if poor else []
         return [*no_better, *self.outdated(sections)]
+
+
+def check_rig(value: object) -> None:
+    """Raise `UsageError` for what is no rig, such as the name of its file."""
+    if not isinstance(value, Rig):
+        raise UsageError(
+            f"found a rig of type {type(value).__name__}, expected calib.Rig, as of calib.Rig.load(path)"
+        )
 
 
 def _said(section: BaseModel) -> str:

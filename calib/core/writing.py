@@ -11,6 +11,7 @@ command reads, and otherwise a file that is empty or of the `Kind` that is about
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import os
 import re
 import sys
@@ -40,12 +41,14 @@ class Kind:
     words : for sentences, as "a log". endings : that a name of it may have; another kind's are refused.
     ours : whether a file that is there is one of these, as calib writes them.
     merged : whether what is there was read, and is written again with what was added.
+    recorded : whether it may be a recording, which gives way to the same bytes alone.
     """
 
     words: str
     endings: tuple[str, ...]
     ours: Callable[[Path], bool]
     merged: bool = False
+    recorded: bool = False
 
 
 _OTHERS = frozenset(
@@ -253,6 +256,11 @@ def replacing(path: Path, kind: Kind | None = None, durable: bool = True) -> Ite
         with _beside(target) as (stream, temporary):
             yield stream
             stream.flush()
+            if kind is not None and kind.recorded and _differ(target, temporary):
+                raise BadInputError(
+                    f"{shown(path)}: is there and says something else, which may be a recording; give "
+                    "another name, or remove it"
+                )
             if durable:
                 os.fsync(stream.fileno())
             _take_over(target, temporary)
@@ -266,6 +274,12 @@ def replacing(path: Path, kind: Kind | None = None, durable: bool = True) -> Ite
         raise BadInputError(f"{shown(path)}: cannot be written: {error.strerror or error}") from error
     if durable:
         settle(target.parent)
+
+
+def _differ(old: Path, new: Path) -> bool:
+    """Whether a file would be lost to another one."""
+    there = old.is_file() and old.stat().st_size > 0
+    return there and not filecmp.cmp(old, new, shallow=False)
 
 
 def settle(folder: Path) -> None:

@@ -528,11 +528,11 @@ def _holds_log(path: Path) -> bool:
     return names[0] == "t_s" and set(names[1:]) <= set(COLUMNS)
 
 
-LOG = Kind("a log", (".csv", ".parquet"), _holds_log)
+LOG = Kind("a log", (".csv", ".parquet"), _holds_log, recorded=True)
 SIMULATED = Kind("a simulated log", LOG.endings, lambda path: not set(TRUE).isdisjoint(column_names(path)))
 
 
-def write_log(path: Path, log: Log, kind: Kind = LOG) -> None:
+def write_log(path: Path, log: Log, kind: Kind | None = None) -> None:
     """Write a log atomically, as Parquet where the name ends so and as CSV otherwise.
 
     Raises `BadInputError` where the place cannot be written.

@@ -9,7 +9,7 @@ import glob
 import importlib
 import inspect
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,7 +64,9 @@ def expanded(sources: Any) -> tuple[Path, ...]:
         if not matches:
             raise BadInputError(f"{text}: matches no file")
         return tuple(Path(one) for one in matches)
-    if not isinstance(sources, Iterable):
+    # A table would give the names of its columns.
+    table = isinstance(sources, bytes | Mapping) or hasattr(sources, "columns")
+    if table or not isinstance(sources, Iterable):
         raise UsageError(f"found {type(sources).__name__}, expected a path, a pattern, or several of them")
     return tuple(path for one in sources for path in expanded(one))
 
@@ -80,8 +82,10 @@ def function(name: str) -> Callable[..., Any]:
     def call(
         sources: str | Path | Sequence[str | Path] | None = None, rig: Rig | None = None, **options: Any
     ) -> Any:
-        from calib.core.rig import Rig
+        from calib.core.rig import Rig, check_rig
 
+        rig = Rig() if rig is None else rig
+        check_rig(rig)
         output = options.pop("output", None) if streams else None
         paths = expanded(sources)
         if made.sources and not made.optional and not paths:
@@ -92,7 +96,7 @@ def function(name: str) -> Callable[..., Any]:
             narrate=logging.getLogger("calib").info,
         )
         with one_command(files.paths):
-            outcome = made.run(files, Rig() if rig is None else rig, options_of(made.options, options))
+            outcome = made.run(files, rig, options_of(made.options, options))
         files.finish()
         return outcome[0] if isinstance(outcome, list) and len(outcome) == 1 else outcome
 

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from calib.core.arrays import FloatArray, rms
 from calib.core.errors import BadInputError, UsageError
 from calib.core.result import Section
-from calib.core.rig import Rig
+from calib.core.rig import Rig, check_rig
 from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.io.logs import Log
@@ -490,7 +490,7 @@ def run_scenario(
     Raises `BadInputError` as `simulate`, and for a duration that is not a number.
     """
     duration = scenario.duration_s if duration_s is None else duration_s
-    if not math.isfinite(duration):
+    if not 0.0 <= duration < math.inf:
         raise BadInputError(f"duration: found {duration}, expected a time")
     return scenario.run(rig, round(duration / rig.pump.tick_s), seed, feedback)
 
@@ -516,6 +516,10 @@ def simulate(
 
     Raises `UsageError`, `BadInputError` as `make_scenario` and `run_scenario`.
     """
+    if rig is not None:
+        check_rig(rig)
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise UsageError(f"seed is {seed!r}, expected a whole number from 0 on")
     machine = SimulatedRig() if rig is None else rig_from_file(rig)
     plan = make_scenario(scenario, settings)
     duration_s = parse_duration_s(duration, "duration") if isinstance(duration, str) else duration

@@ -32,6 +32,7 @@ def place(swing: bytes, rig: Path, project_root: Path) -> Path:
     for path in sorted((project_root / "images").glob("view0*.png"))[:6]:
         shutil.copy(path, folder / "images")
     (folder / "photo.pdf").write_bytes(b"%PDF-1.4 a thesis")
+    (folder / "recorded.csv").write_text("t_s,gz_radps\n0,0.1\n")
     (folder / "table.csv").write_text("name,price\nbolt,3\n")
     shutil.copy(folder / "rig.yaml", folder / "other.yaml")
     (folder / "fleet.csv").write_text("name,path\na,.\n")
@@ -54,6 +55,7 @@ REFUSED = {
     "replay in.csv -o states.yaml": "states.yaml: ends in .yaml, expected .csv, .parquet or .mcap for states",
     "convert in.csv -o in.csv": "in.csv: is an input of this command",
     "convert in.csv -o table.csv": "table.csv: is there, and is not a log that calib wrote",
+    "convert in.csv -o recorded.csv": "recorded.csv: is there and says something else, which may be a record",
     "convert in.csv -o out.csv --save-columns rig.yaml": "rig.yaml: ",
     "convert in.csv -o out.csv --save-columns out.csv": "out.csv: would hold a log and a columns.yaml",
     "export ros -o rig.yaml": "rig.yaml: ",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import re
 import shlex
 import shutil
@@ -27,6 +28,7 @@ import calib
 from calib.cli.app import command_line
 from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
 from calib.cli.simulate import simulate
+from calib.core.arrays import points_of
 from calib.core.bounded_yaml import load
 from calib.core.errors import DISTRIBUTION, UsageError, pip_install
 from calib.core.rig import KINDS
@@ -110,7 +112,11 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     np.testing.assert_allclose(rig.plane.to_world(pixels, rig.camera), place, atol=1e-9)
     seen = np.array(rig.plane.R_CW)[:, :2] @ place[0] + rig.plane.t_CW_m
     np.testing.assert_allclose(rig.camera.project([seen, -seen]), [*pixels, [np.nan, np.nan]])
+    with pytest.raises(UsageError, match="camera is of type Plane"):
+        rig.plane.to_world(pixels, rig.plane)
     assert Path("firmware_constants/calib_constants.h").is_file()
+    header = names["calib"].firmware(rig)
+    assert pickle.loads(pickle.dumps(header)) == header
     assert "<table>" in rig.camera._repr_html_()
     assert set(names["calib"].plots(states)) == {
         f"ellipse_{one}" for one in ("states", "innovations", "errors")
@@ -127,7 +133,15 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
         (lambda: calib.intrinsics("images", square_m=math.nan), "square_m=nan is not a number with a unit"),
         (lambda: calib.intrinsics([]), "intrinsics: found no paths; it takes: A folder of pictures"),
         (lambda: calib.intrinsics(np.zeros((48, 64))), "found float64, expected a path"),
+        (lambda: calib.intrinsics({"images": 1}), "found dict, expected a path"),
+        (lambda: calib.intrinsics("images", "rig.yaml"), "found a rig of type str, expected calib.Rig"),
+        (lambda: calib.Rig().diff("rig.yaml"), "found a rig of type str, expected calib.Rig"),
+        (lambda: setattr(calib.Rig(), "cammera", None), "rig.cammera: there is no such section; did you"),
+        (lambda: calib.Rig(plane=calib.Rig()), "rig.plane: found a value of type Rig, expected Plane"),
         (lambda: calib.plots(None), "plots: found NoneType, expected a result"),
+        (lambda: calib.simulate("static", seed=-1), "seed is -1, expected a whole number from 0 on"),
+        (lambda: points_of(np.zeros((2, 5)), 2), "found numbers of shape (2, 5), expected points (n, 2)"),
+        (lambda: points_of([[1, 2], [3]], 2), "found no table of numbers, expected points (n, 2)"),
     ],
 )
 def test_what_a_function_cannot_take_is_one_sentence(call: Callable[[], object], sentence: str) -> None:

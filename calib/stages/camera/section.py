@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from calib.core.errors import UsageError
 from calib.core.files import quoted
 from calib.core.result import (
     Count,
@@ -133,20 +134,20 @@ class Camera(Result):
         """
         import numpy as np
 
+        from calib.core.arrays import points_of
         from calib.stages.camera.model import project
 
-        camera, points = self.optics, np.asarray(points_m, dtype=np.float64).reshape(-1, 3)
+        camera, points = self.optics, points_of(points_m, 3)
         behind = (points[:, 2] <= 0.0) & (not camera.fisheye)
         return project(camera, np.where(behind[:, None], np.nan, points))
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
         """Pixels (n, 2) where a pinhole camera with the same intrinsics would have seen them."""
-        import numpy as np
-
+        from calib.core.arrays import points_of
         from calib.stages.camera.model import undistort
 
         camera = self.optics
-        plain = undistort(camera, np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
+        plain = undistort(camera, points_of(pixels, 2))
         return plain @ camera.K[:2, :2].T + camera.K[:2, 2]
 
 
@@ -196,10 +197,10 @@ class Plane(Result):
         """Pixels (n, 2), lens and all, at which the camera sees places on the plane (n, 2) in metres."""
         import numpy as np
 
+        from calib.core.arrays import points_of
         from calib.stages.camera.model import project
 
-        places = np.asarray(world_m, dtype=np.float64).reshape(-1, 2)
-        points = places @ np.array(self.R_CW)[:, :2].T + np.array(self.t_CW_m)
+        points = points_of(world_m, 2) @ np.array(self.R_CW)[:, :2].T + np.array(self.t_CW_m)
         return project(camera.optics, points)
 
     def to_world(self, pixels: ArrayLike, camera: Camera | None = None) -> FloatArray:
@@ -211,12 +212,13 @@ class Plane(Result):
         """
         import numpy as np
 
+        from calib.core.arrays import points_of
         from calib.core.geometry import apply_homography
 
-        ideal = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-        return apply_homography(
-            np.array(self.A_inverse), ideal if camera is None else camera.undistort(ideal)
-        )
+        if not isinstance(camera, Camera | None):
+            raise UsageError(f"camera is of type {type(camera).__name__}, expected one as rig.camera")
+        ideal = points_of(pixels, 2) if camera is None else camera.undistort(pixels)
+        return apply_homography(np.array(self.A_inverse), ideal)
 
 
 class InverseLens(Section):

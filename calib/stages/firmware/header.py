@@ -15,7 +15,6 @@ from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from statistics import median
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jinja2
@@ -133,7 +132,7 @@ class Header:
     @cached_property
     def values(self) -> Mapping[str, float]:
         """Every value as a compiler reads it, by name."""
-        return MappingProxyType(values(self.literals))
+        return values(self.literals)
 
     @property
     def identity(self) -> int:
@@ -324,4 +323,4 @@ def header_of(rig: Rig, source: str) -> Header:
     canonical = "\n".join(f"{name} {literal}" for name, literal in found.items())
     digest = hashlib.sha256(f"{canonical}\n".encode()).hexdigest()
     text = text.replace("@SHA256@", digest).replace("@ID@", digest[:8].upper())
-    return Header(text, MappingProxyType(found), digest, verdict)
+    return Header(text, found, digest, verdict)
