@@ -26,6 +26,7 @@ from calib.stages.actuator.identify_pump import (
     _by_chance,
     _Problem,
     _solve,
+    ceiling,
     cross_validate,
     fit_pump,
     identify_pump,
@@ -295,10 +296,36 @@ def test_columns_are_recognised(tmp_path: Path, head: str, unit: str) -> None:
     assert np.allclose(table.record.value, _rows()[:, 2], atol=1e-4)
 
 
-def test_shares_of_the_full_duty_are_refused(tmp_path: Path) -> None:
-    path = _write(tmp_path / "a.csv", "t_s,pwm,pressure_kPa", _rows() / [1.0, 255.0, 1.0])
-    with pytest.raises(BadInputError, match=r"a\.csv: PWM is 1 at most, expected 0 to 255; .*by 255"):
-        read_pump_table(path)
+@pytest.mark.parametrize(
+    ("scale", "sentence"),
+    [
+        ([1.0, 1.0 / 255.0, 1.0], "PWM is 1 at most, expected 0 to 255; .*by 255"),
+        ([1.0, 1.0 / 2.55, 1.0], "PWM is 100 at most and not whole, as a percentage"),
+        ([1.0, 1.0, 0.01], "Pressure is 0.2586 at most, expected 1 to 2000 kPa; of another unit"),
+        ([1.0, 1.0, 1e3], r"Pressure is 2.586e\+04 at most, expected 1 to 2000 kPa; of another unit"),
+        ([0.0, 0.0, 101.3], "Pressure is 101.3 kPa with the pump off, as one that counts from vacuum"),
+    ],
+)
+def test_columns_in_other_units_are_refused(tmp_path: Path, scale: list[float], sentence: str) -> None:
+    rows = _rows()
+    rows[20, 1] = 120.0
+    rows = rows * scale if scale[0] else rows + scale
+    with pytest.raises(BadInputError, match=rf"a\.csv: {sentence}"):
+        read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,Pressure", rows))
+
+
+@pytest.mark.parametrize("step", [0.0, 0.01, 0.2])
+def test_a_sensor_at_the_end_of_its_range_is_told_from_a_chamber_that_is_full(step: float) -> None:
+    t = 0.02 * np.arange(400)
+    y = 30.0 * -np.expm1(-t / 0.6)
+    y = np.round(y / step) * step if step else y
+    held = np.repeat(y[::10], 10)
+    whole = [PumpRecord("whole", t, np.full(400, 255.0), one) for one in (y, held, np.round(y, 3))]
+    assert [ceiling(one) for one in whole] == [None] * 3
+    quick = [30.0 * -np.expm1(-t / lag_s) for lag_s in (0.01, 0.02, 0.04)]
+    assert [ceiling(replace(whole[0], value=np.round(one, 2))) for one in quick] == [None] * 3
+    top, at_s = ceiling(replace(whole[0], value=np.minimum(y, 20.2))) or (0.0, 0.0)
+    assert top == 20.2 and at_s == pytest.approx(0.67, abs=0.02)
 
 
 def test_real_tables(shared_data: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from calib.core.arrays import BoolArray, FloatArray, rms, robust_sigma
+from calib.core.arrays import BoolArray, FloatArray, rms, robust_sigma, runs
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged, section_json
@@ -805,6 +805,27 @@ def jumps(records: Sequence[PumpRecord]) -> tuple[tuple[str, float, float], ...]
     return tuple(out)
 
 
+_STAYS = 10
+_STILL_RISES = 5e-3
+"""Of the range within three samples; a lag of .6 s at 50 Hz rises so at 95 % of its end."""
+
+
+def ceiling(record: PumpRecord) -> tuple[float, float] | None:
+    """The largest value and when a run comes to stay at it without having slowed down; None for others.
+
+    A chamber that fills stays at a reading ever longer, or, with a lag of hardly a sample, comes to its end
+    by steps each of a small part of the last.
+    """
+    t, y = record.t_s - record.t_s[0], record.value
+    k, behind = max(runs(y == y.max()), key=lambda one: one[1] - one[0])
+    if k < 3 or behind - k < _STAYS:
+        return None
+    steps = np.diff(y[k - 3 : k + 1])
+    if min(steps) <= 0.0 or steps[1] < 0.5 * steps[0] or steps.sum() < _STILL_RISES * float(np.ptp(y)):
+        return None
+    return float(y[k]), float(t[k])
+
+
 # ----------------------------------------------------------------------
 # The static map of a pump from settled values: dead zone, saturation, and what scatters about them.
 #
@@ -847,7 +868,10 @@ def fit_static_map(name: str, pwm: FloatArray, value: FloatArray) -> StaticMap:
 
     u, y = np.asarray(pwm, dtype=np.float64), np.asarray(value, dtype=np.float64)
     if len(np.unique(u)) < _FEWEST:
-        raise BadInputError(f"{name}: has {len(np.unique(u))} levels of PWM, expected at least {_FEWEST}")
+        raise BadInputError(
+            f"{name}: has {len(np.unique(u))} levels of PWM, expected at least {_FEWEST}; rows "
+            "that are a second apart are taken for settled values: is the time in seconds?"
+        )
     sign = -1.0 if float(np.median(y)) < 0.0 else 1.0
     size = sign * y
     top = float(np.quantile(size, 0.9))
@@ -1049,6 +1073,7 @@ _FEWEST_RUNS = 3
 _MOST_VAGUE = 0.5
 _PASSAGE = ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
 """What may be vague: parts of the passage make up for each other."""
+_WRITTEN = ("lag_s", "dead_time_s")
 
 
 def unexplained(found: PumpFound) -> list[Finding]:
@@ -1081,6 +1106,13 @@ def unexplained(found: PumpFound) -> list[Finding]:
             "the chamber had been under pressure behind a closed valve",
             "let the chamber empty before a recording begins",
         )
+    for record in found.records:
+        if (end := ceiling(record)) is not None:
+            add(
+                f"{record.name} rises to {end[0]:.4g} {unit} within {end[1]:.2f} s and stays exactly there, "
+                "without having slowed down: the sensor is at the end of its range, or a valve opened",
+                "record with less pressure, or with a sensor of a wider range",
+            )
     for m in found.maps:
         if m.fit.outliers_pwm:
             values = ", ".join(f"{u:g}" for u in m.fit.outliers_pwm)
@@ -1118,13 +1150,15 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
             f"{100.0 * rms / span:.0f} % of the range",
             "record each run from an empty chamber, with the same supply and load",
         )
-    for name, sigma in fit.sigma.items():
-        value = abs(fit.values[name])
-        if name not in _PASSAGE and sigma > _MOST_VAGUE * value:
+    told = {model: found.fits[model] for model in dict.fromkeys((better, LAG))}
+    for model, name in ((model, name) for model, one in told.items() for name in one.sigma):
+        value, sigma = abs(told[model].values[name]), told[model].sigma[name]
+        # Of the lag, lag and dead time go into the section, whichever model is better.
+        if name not in _PASSAGE and sigma > _MOST_VAGUE * value and (model == better or name in _WRITTEN):
             known = f"known to {100.0 * sigma / value:.0f} % only" if sigma < value else "not told by these"
             yield Finding(
                 "poor",
-                f"{name} of the {better} is {known}: {fit.values[name]:.3g} +- {sigma:.2g}",
+                f"{name} of the {model} is {known}: {value:.3g} +- {sigma:.2g}",
                 "record steps of the PWM up and down, from rest, at 50 Hz or more",
             )
     settles = found.settles(better)

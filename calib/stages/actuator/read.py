@@ -46,6 +46,10 @@ STATIC_S = 0.9
 _TIME = ("t_s", "time", "time_s", "timestamp", "timestamp_s", "t")
 _PWM = ("pwm", "pwm1", "pwm_input", "pwm_main")
 _VALUE = ("pressure_kpa", "feedback_kpa", "pressure", "force_n", "force")
+_KPA = (1.0, 2000.0)
+"""What the pressure of a pump is at most."""
+_AIR_KPA = (80.0, 110.0)
+"""Pressure of the air, from 2000 m above the sea down to it."""
 _MOST_BAD = 0.05
 _FEWEST = 20
 _SHORTEST_S = 0.5
@@ -88,9 +92,10 @@ def read_pump_table(
     table, kept = table[good], [k for k in range(len(rows)) if good[k]]
     t, u, y = table.T
     name = shown(path.name)
+    assumed = unit is None and header[at[2]].lower() == "pressure"
     if unit is None:
         unit = "N" if header[at[2]].lower().startswith("force") else "kPa"
-        if header[at[2]].lower() == "pressure":
+        if assumed:
             said.append(f"takes the column {header[at[2]]} for kPa")
     outside = np.nonzero((u < 0.0) | (u > 255.0))[0]
     if len(outside):
@@ -101,15 +106,34 @@ def read_pump_table(
             f"{shown(path)}: PWM is {float(u.max()):.3g} at most, expected 0 to 255; where it is a share of "
             "the full duty, multiply the column by 255"
         )
+    if u.max() == 100.0:
+        if np.any(u % 1.0):
+            raise BadInputError(
+                f"{shown(path)}: PWM is 100 at most and not whole, as a percentage, expected 0 to 255; "
+                "multiply the column by 2.55"
+            )
+        said.append("PWM is 100 at most, taken for 100 of 255; multiply a percentage by 2.55")
     back = np.nonzero(np.diff(t) < 0.0)[0]
     if len(back):
         line = lines[kept[int(back[0]) + 1]]
         raise BadInputError(
             f"{shown(path)}, line {line}: time goes back from {t[back[0]]:g} to {t[back[0] + 1]:g} s"
         )
-    if len(t) > 1 and float(np.median(np.diff(t))) >= STATIC_S:
-        return PumpTable(unit, None, _settled(name, header, [rows[k] for k in kept], u, y), tuple(said))
-    return PumpTable(unit, _record(path, name, t, u, y, [lines[k] for k in kept]), (), tuple(said))
+    static = len(t) > 1 and float(np.median(np.diff(t))) >= STATIC_S
+    settled = _settled(name, header, [rows[k] for k in kept], u, y) if static else ()
+    record = None if static else _record(path, name, t, u, y, [lines[k] for k in kept])
+    most, column = float(np.abs(y).max()), header[at[2]]
+    if assumed and not _KPA[0] <= most <= _KPA[1]:
+        raise BadInputError(
+            f"{shown(path)}: {column} is {most:.4g} at most, expected {_KPA[0]:g} to {_KPA[1]:g} kPa; of "
+            "another unit? One that is in kPa is taken with --unit kPa"
+        )
+    if unit == "kPa" and _AIR_KPA[0] < y.min() < _AIR_KPA[1] and not u[y.argmin()]:
+        raise BadInputError(
+            f"{shown(path)}: {column} is {y.min():.4g} kPa with the pump off, as one that counts from "
+            "vacuum; subtract the pressure of the air"
+        )
+    return PumpTable(unit, record, settled, tuple(said))
 
 
 def _settled(
