@@ -371,6 +371,18 @@ def _lit(gray: GrayImage, corners: FloatArray) -> GrayImage:
     return np.clip(gray + 255.0 * np.exp(-((away / (0.8 * side)) ** 4)), 0, 255).astype(np.uint8)
 
 
+def test_boards_in_light_through_blinds_are_found() -> None:
+    """Bars as wide as squares, with a third of the light, cross them all."""
+    for seed in range(4):
+        gray, truth = _picture(PIXY, Board(9, 6, 0.025), seed)
+        v, u = np.indices(gray.shape)
+        phase = 2.0 * np.pi * (0.98 * v + 0.2 * u) / 20.8
+        barred = gray * (0.35 + 0.65 / (1.0 + np.exp(-2.2 * np.sin(phase))))
+        error = _error(detect(barred.astype(np.uint8), 9, 6), truth)
+        # OpenCV's classic finder with cornerSubPix: .43 to .55 px.
+        assert np.sqrt(np.mean(error**2)) < 0.4, seed
+
+
 @pytest.mark.few(1)
 @pytest.mark.parametrize("camera", [VGA, PIXY], ids=["640x480", "316x208"])
 def test_boards_in_uneven_light_are_found(camera: Camera) -> None:

@@ -164,9 +164,13 @@ def _squares_are_plain(grid: Refined, close: bool) -> bool:
         rise = float(np.median((profile.max(axis=0) - rim)[~bright]))
         if sag - max(rise, 0.0) > _SAG * step and grid.part.halo_px == 0.0:
             return False
+    # Light through blinds makes a square uneven as well, but no part of a bright one as dark as dark ones.
+    framed = np.pad(np.where(bright, -np.inf, tone), 1, constant_values=-np.inf)
+    dark = np.max([framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:]], axis=0)
     uneven, marked = (
-        np.ptp(some.reshape(-1, *tone.shape), axis=0) > _FLAT * np.maximum(local, 0.25 * step)
-        for some in (tones[0], tones)
+        (np.ptp(parts, axis=0) > _FLAT * np.maximum(local, 0.25 * step))
+        & (~bright | (parts.min(axis=0) < dark + (1.0 - _FLAT) * local.min()))
+        for parts in (some.reshape(-1, *tone.shape) for some in (tones[0], tones))
     )
     few_marked = np.sum(marked & bright) <= _MARKED_SHARE * np.sum(bright)
     return bool(np.mean(uneven) < _UNEVEN_SHARE and few_marked)
