@@ -15,6 +15,7 @@ import filecmp
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,6 +61,8 @@ _OTHERS = frozenset(
 )  # fmt: skip
 """Endings that promise some kind of file; under any other a file may be of each kind."""
 
+_TURN_S = 10.0
+"""Longer than any file is written, unless its process was stopped."""
 RIG_FILE = "rig.yaml"
 """The name that is left to the sections of a rig."""
 
@@ -397,6 +400,21 @@ def try_lock(descriptor: int) -> bool:
     except OSError:
         return False
     return True
+
+
+@contextlib.contextmanager
+def one_at_a_time(path: Path) -> Iterator[None]:
+    """Read, change and write a file while no other process does; only where folders can be locked."""
+    descriptor, until = None, time.monotonic() + _TURN_S
+    with contextlib.suppress(OSError):
+        descriptor = os.open(_target(path).parent, os.O_RDONLY)
+    try:
+        while descriptor is not None and not try_lock(descriptor) and time.monotonic() < until:
+            time.sleep(0.01)
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def _take_over(old: Path, new: Path) -> None:

@@ -29,7 +29,7 @@ from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig
 from calib.core.stage import AnyStage, Files
-from calib.core.writing import check_figures, check_folder, check_writable, write_atomically
+from calib.core.writing import check_figures, check_folder, check_writable, one_at_a_time, write_atomically
 from calib.runner.cache import BLOCKS
 from calib.stages import stage
 
@@ -67,6 +67,7 @@ def _carried_out(
     # A name that a person has mistyped is no empty rig for a stage that lives on its sections.
     of_data = made.writes_rig(options) and bool(made.sources) and not made.needs
     may_begin = of_data or (rig_path.name == RIG and rig_path.parent.is_dir())
+    before = _stamp(rig_path)
     rig = Rig.load(rig_path, missing_ok=may_begin)
     try:
         outcome = made.run(files, rig, options)
@@ -77,8 +78,12 @@ def _carried_out(
         raise
     sections = made.sections(outcome)
     if sections:
-        rig = rig.with_sections(sections)
-        rig.save(rig_path)
+        with one_at_a_time(rig_path):
+            if _stamp(rig_path) not in (before, None):
+                # What a person or another command has written meanwhile stays.
+                rig = Rig.load(rig_path)
+            rig = rig.with_sections(sections)
+            rig.save(rig_path)
     if output is not None and output.write is not None and files.output is not None:
         files.written = [path.name for path in output.write(files, outcome)]
         if files.written and output.folder:
@@ -90,6 +95,15 @@ def _carried_out(
 
         write_figures(figures, made.plots(outcome))
     return outcome, rig
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What changes with a file; None for none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 def perform(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,13 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from calib.core.errors import BadInputError
+from calib.core.options import options_of
 from calib.core.result import CovarianceTable, identity, section_json
-from calib.core.rig import KINDS, Rig, kind_of
+from calib.core.rig import KINDS, Geometry, Rig, kind_of
 from calib.core.schema import validated
+from calib.core.stage import Files
+from calib.runner.work import carry_out
+from calib.stages import stage
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import Orifice, static_force_N
@@ -468,3 +473,17 @@ def test_a_plane_that_its_own_pose_does_not_give_is_refused(project_root: Path, 
         rig.plane.t_CW_m[0] += 1e-3
     with pytest.raises(BadInputError, match=r"rig\.yaml: plane\.A_px_per_m is .* px off from what camera"):
         rig.current_plane("rig.yaml")
+
+
+def test_what_was_written_while_a_verb_worked_stays(tmp_path: Path) -> None:
+    """By a person or by another verb; the file that this one began with is older."""
+    path, made = tmp_path / "rig.yaml", stage("lowpass")
+
+    def meanwhile(*given: Any) -> Any:
+        Rig(geometry=Geometry(marker_offset_m=0.02)).save(path)
+        return made.solve(*given)
+
+    options = options_of(made.options, {"cutoff_hz": "2Hz"})
+    carry_out(replace(made, solve=meanwhile), Files(rig_path=path), options, path)
+    both = Rig.load(path)
+    assert both.lowpass is not None and both.geometry == Geometry(marker_offset_m=0.02)
