@@ -704,6 +704,22 @@ def test_a_rate_of_another_scale_or_one_that_comes_late_is_named(
     assert words in found.text
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_swing_that_begins_with_a_jerk_along_the_head_contradicts_nothing(seed: int) -> None:
+    """A head that was pulled aside is stretched by a millimetre or two: more than g at first.
+
+    Ten means over half a second hardly tell the rate's noise then.
+    """
+    t, rng = 0.01 * np.arange(500), np.random.default_rng(seed)
+    swing = 0.33 * np.exp((-1.35 + 26.4j) * t)
+    phi, dphi, ddphi = (((-1.35 + 26.4j) ** k * swing).real for k in range(3))
+    jerk = (17.0, -17.0, -25.0)[seed] * np.exp(-t / 0.08) * np.cos(75.4 * t)
+    ax = 9.81 * np.cos(phi) + 0.04 * dphi**2 + jerk + rng.normal(0.0, 0.02, 500)
+    ay = 9.81 * np.sin(phi) + 0.04 * ddphi + rng.normal(0.0, 0.02, 500)
+    piece = Piece("swing.csv", t, np.arctan2(ay, ax), dphi + rng.normal(0.0, 0.003, 500))
+    assert contradictions([piece], tune([piece], DATA_SHEET)) == []
+
+
 def test_readings_at_the_end_of_their_range_make_it_poor_but_for_a_knock() -> None:
     t, end = 0.01 * np.arange(3000), np.radians(250.0)
     rng = np.random.default_rng(0)

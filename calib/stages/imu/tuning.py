@@ -321,6 +321,8 @@ _NONE_RAD = 1e-6
 """Size of c where there is none, which keeps the covariance regular."""
 _NOISIER = 9
 _STATES = 6
+_SURE_LIKELIHOOD = 2.0
+"""Logarithm by which a likelihood is higher where one number is two standard deviations off."""
 _KNOCK = 6.0
 """Standard deviations of an innovation from which on its variance is what it is itself."""
 _BIAS_SIGMA_RADPS = 0.05
@@ -474,21 +476,34 @@ def _likelihoods(blocks: _Blocks, q_b: float, P: FloatArray, tried: FloatArray) 
     return out
 
 
+def _first(blocks: _Blocks) -> _Blocks:
+    """Those that a likelihood is computed of."""
+    return _Blocks(*(values[:_LIKELY_BLOCKS] for values in blocks))
+
+
 def _most_likely(blocks: _Blocks, q_b: float, P: FloatArray, tried: FloatArray) -> FloatArray:
     """Row (4,) of highest likelihood of `tried` (n, 4)."""
-    few = _Blocks(*(values[:_LIKELY_BLOCKS] for values in blocks))
-    return np.asarray(tried[int(np.argmax(_likelihoods(few, q_b, P, tried)))])
+    return np.asarray(tried[int(np.argmax(_likelihoods(_first(blocks), q_b, P, tried)))])
 
 
 def _likely(blocks: _Blocks, q_least: float, q_b: float, r_least: float, P: FloatArray) -> FloatArray:
-    """q, r, tau and c of highest likelihood: over wide steps, then over narrow ones about the best."""
+    """q, r, tau and c of highest likelihood: over wide steps, then over narrow ones about the best.
+
+    q is the least one unless the blocks are sure that it is more.
+    """
     q, r = q_least * 4.0 ** np.arange(11), r_least * 4.0 ** np.arange(12)
     lasting = [(1.0, _NONE_RAD), *((tau, c) for tau in _LASTING_S for c in _LASTING_RAD)]
     rows = np.array([(a, b, tau, c) for a in q.tolist() for b in r.tolist() for tau, c in lasting])
-    best = _most_likely(blocks, q_b, P, rows)
+    likely = _likelihoods(_first(blocks), q_b, P, rows)
+    # Of a few swings the likelihood hardly tells q; the rate errs as the sensor until a log is sure of more.
+    least = rows[:, 0] == q_least
+    if likely[least].max() > likely.max() - _SURE_LIKELIHOOD:
+        rows, likely = rows[least], likely[least]
+    best = np.asarray(rows[int(np.argmax(likely))])
     for step in (2.0, math.sqrt(2.0)):
         about = (1.0 / step, 1.0, step)
-        rows = np.array([best * (a, b, e, f) for a in about for b in about for e in about for f in about])
+        noisier = about if best[0] > q_least else (1.0,)
+        rows = np.array([best * (a, b, e, f) for a in noisier for b in about for e in about for f in about])
         rows = np.maximum(rows, [q_least, r_least, 0.1, _NONE_RAD])
         best = _most_likely(blocks, q_b, P, rows)
     return best
@@ -964,16 +979,23 @@ def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> f
     """
     theta = integral(t_s, rate_radps)
     turning = np.convolve(np.gradient(rate_radps, t_s), np.full(5, 0.2), "same")
-    felt = _level(t_s, np.unwrap(phi_acc_rad))
+    angles = np.unwrap(phi_acc_rad)
+    felt = _level(t_s, angles)
     known = np.isfinite(felt)
     if int(known.sum()) < 20 or float(_level(t_s, theta)[known].std()) < 2.0 * _TURNS_RAD:
         return 0.0
     rests = []
     for late in _LATE_S.tolist():
-        left = felt - _level(t_s, np.interp(t_s - late, t_s, theta))
-        lever = _level(t_s, np.interp(t_s - late, t_s, turning))
-        fit = float(left[known] @ lever[known]) / max(float(lever[known] @ lever[known]), 1e-12)
-        rests.append(robust_sigma((left - fit * lever)[known]))
+        apart, lever = angles - np.interp(t_s - late, t_s, theta), np.interp(t_s - late, t_s, turning)
+        kept = known
+        # A jerk, as of a head that is let go, has no say in the lever and in what is level.
+        for _ in range(3):
+            x, y = (_level(t_s, np.where(kept, values, np.nan)) for values in (lever, apart))
+            kept = np.isfinite(y)
+            rest = y - float(y[kept] @ x[kept]) / max(float(x[kept] @ x[kept]), 1e-12) * x
+            spread = robust_sigma(rest[kept])
+            kept = kept & (np.abs(rest) <= 4.0 * max(spread, 1e-6))
+        rests.append(spread)
     k, zero = int(np.argmin(rests)), len(rests) // 2
     clear = rests[k] < min(_LEFT_OF_FELT * robust_sigma(felt[known]), _LEFT_OF_REST * rests[zero])
     return float(_LATE_S[k]) if clear and k not in (0, len(rests) - 1) else 0.0
