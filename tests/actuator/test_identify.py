@@ -26,10 +26,12 @@ from calib.stages.actuator.identify import (
     Track,
     by_logs,
     colour_of,
+    crossed,
     decrement,
     first_guess,
     fit_stiffness,
     fit_tracks,
+    head_of,
     heads_of,
     held_back,
     jacobian,
@@ -437,6 +439,20 @@ def test_pumps_that_are_swapped_are_named(swapped: tuple[int, ...]) -> None:
     said = [one.text for one in judge(found, uncertainty(found), colour_of(found), [], []).findings]
     named = {text.partition(":")[0] for text in said if "bends away from the pump that pushes" in text}
     assert named == {tracks[k].name for k in swapped}
+
+
+def test_a_controller_that_pushes_against_unlike_pumps_has_none_swapped() -> None:
+    """The stronger pump bends the head, and is driven less: a model of like pumps bends the other way."""
+    one = track("steps")
+    pwm = np.where(one.t_s[:, None] < 2.5, 200.0 + np.array([3.0, -3.0]), 0.0)
+    nominal, unlike = Machine(), Machine(strength=(0.9, 1.1))
+    problem = Problem(nominal, [replace(one, pwm=pwm)], (), {})
+    x = first_guess(problem, {})
+    model, seen = (head_of(replace(problem, nominal=rig), x, 0) for rig in (nominal, unlike))
+    assert np.corrcoef(model[:, 0], seen[:, 0])[0, 1] < -0.9
+    problem = replace(problem, tracks=[replace(one, pwm=pwm, head=seen)])
+    alike = crossed(Solution(problem, x, np.zeros(0), np.zeros((0, 0)), 0.0, {}, 1, 1))
+    assert alike[one.name] > 0.9
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.2])

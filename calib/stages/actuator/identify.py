@@ -1959,21 +1959,31 @@ _LEAST_READINGS = 0.5
 """Moments of a log at which a camera may have moved; noises of a reading, .2 px, below which it has not."""
 _STATED_OFF = 0.02
 _CROSSED, _BENDS_RAD = -0.5, 0.05
+_UNLIKE = 1.15
+"""Factor by which one of two pumps may be stronger, and the other weaker, than it should."""
 
 
 def crossed(solution: Solution) -> dict[str, float]:
     """Correlation of angles with those of the model from which the fit began, by the name of a log.
 
     Only of logs whose pumps push apart. The fit itself makes pumps weak that bend the rig the other way.
+    A controller pushes against what unlike pumps bend, so the largest correlation is taken of a model with
+    pumps alike and with either one stronger.
     """
     problem, found = solution.problem, {}
+    alike = dict(zip(STRENGTHS, problem.nominal.strength, strict=True))
+    one, other = STRENGTHS
     for k, track in enumerate(problem.tracks):
         if track.hoses:
             delay_s, start = float(solution.x[problem.unknowns.delays[k]]), start_of(problem, solution.x, k)
-            head, _ = heads_of(track, [problem.pair(track, {})], [start], delay_s)
-            both = np.stack([head[0][:, 0], track.head[:, 0]])
-            if np.isfinite(both).all() and np.ptp(both, axis=1).min() > _BENDS_RAD:
-                found[track.name] = float(np.corrcoef(both)[0, 1])
+            pairs = [
+                problem.pair(track, {one: more * alike[one], other: alike[other] / more})
+                for more in (1.0, _UNLIKE, 1.0 / _UNLIKE)
+            ]
+            heads, _ = heads_of(track, pairs, [start] * len(pairs), delay_s)
+            both = [np.stack([head[:, 0], track.head[:, 0]]) for head in heads]
+            if np.isfinite(both).all() and np.ptp(both[0], axis=1).min() > _BENDS_RAD:
+                found[track.name] = max(float(np.corrcoef(pair)[0, 1]) for pair in both)
     return found
 
 
