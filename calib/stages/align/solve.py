@@ -9,6 +9,7 @@ from functools import cached_property, partial
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from calib.core.arrays import BoolArray, FloatArray, integral, rms, robust_sigma
@@ -456,14 +457,20 @@ class Started:
     moves: bool
 
 
+_SETTLED_S = 0.05
+"""In which a low-pass of 20 Hz or more forgets what was: a log of a swing begins as the head is let go, and
+the sensor still shows the hand for some samples."""
+
+
 def _cuts(log: AlignLog) -> list[float]:
-    """Times at which a log is split: where nobody knows how far the head turned."""
+    """Times at which a log begins and is split: where nobody knows how far the head turned."""
     felt = log.imu_s[np.isfinite(log.readings[:, 2])]
     if len(felt) < 2:
         return [-math.inf, math.inf]
     steps = np.diff(felt)
     gaps = np.flatnonzero(steps > max(SPLIT_S, _SPLIT_STEPS * float(np.median(steps))))
-    return [-math.inf, *(0.5 * (felt[i] + felt[i + 1]) for i in gaps.tolist()), math.inf]
+    first = float(felt[0]) + _SETTLED_S
+    return [first, *(0.5 * (felt[i] + felt[i + 1]) for i in gaps.tolist() if felt[i] > first), math.inf]
 
 
 def _fives(values: FloatArray) -> FloatArray:
@@ -1294,6 +1301,16 @@ def _own(problem: Problem, fit: Fit, name: str, stretch: Stretch, c: FloatArray)
         yield rows, rows.by[:, :, at], pull, weight
 
 
+def _accelerations_at(stretch: Stretch, late_s: float) -> Stretch:
+    """A stretch whose accelerations, which come late, are those of the moments of its rates."""
+    readings = stretch.readings.copy()
+    for k in range(2):
+        known = np.isfinite(readings[:, k])
+        t, values = stretch.imu_s[known], readings[known, k]
+        readings[known, k] = CubicSpline(t, values)(np.clip(t + late_s, t[0], t[-1]))
+    return replace(stretch, readings=readings)
+
+
 def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
     """What accelerations that are late beside the rates change of the IMU's readings."""
     for part in chunks(len(stretch.imu_s)):
@@ -1386,11 +1403,21 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     sensor = mean.copy()
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)
+    late = [one for one in _apart(problem, fit, 1) if one.name == _LATE]
+    for one in late:
+        at_once = tuple(
+            replace(_accelerations_at(stretch, one.away), start=c)
+            for stretch, c in zip(problem.stretches, fit.coefficients, strict=True)
+        )
+        problem = replace(problem, stretches=at_once)
+        fit = solve(problem, fit.sensor, fit.noise)
     moved = settings.turn_sigma_rad * turned(problem, fit)
     covariance = fit.covariance + _walked(settings, problem, fit) + np.outer(moved, moved)
-    apart = _apart(problem, fit, len(logs))
-    for one in apart:
+    # What is left of a delay that was taken out is its deviation.
+    apart = [one for one in _apart(problem, fit, len(logs)) if not late or one.name != _LATE]
+    for one in [*apart, *(replace(one, moved=one.moved / one.deviations) for one in late)]:
         covariance += np.outer(one.moved, one.moved)
+    apart = [*late, *apart]
     clock_s = max(clock_sigma_s(piece) for piece in pieces)
     covariance[_OFFSET, _OFFSET] += clock_s**2
     # Before: the sensors as they were assumed to be.
@@ -1609,8 +1636,8 @@ def _late_accelerometer(found: Alignment) -> Iterator[Finding]:
             when = "after" if one.away > 0.0 else "before"
             yield Finding(
                 "poor" if abs(one.away) > _LATE_S[1] else "remark",
-                f"accelerations come about {1e3 * abs(one.away):.1f} ms {when} the rates of the same motion, "
-                "which moves where the IMU is taken to be",
+                f"accelerations come about {1e3 * abs(one.away):.1f} ms {when} the rates of the same motion; "
+                "the alignment takes them at once",
                 "give accelerometer and gyroscope low-passes of one bandwidth, and read both at once",
             )
 
