@@ -102,7 +102,9 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
         if not regular:
             return False
         if not follow_links and not inside(path, root):
-            left_out.append(f"{_named(path, root)}: is a link out of the folder and was left out")
+            left_out.append(
+                f"{_named(path, root)}: is a link out of the folder and was left out; --follow-links takes it"
+            )
             return False
         return True
 
@@ -156,6 +158,10 @@ def _passed_over(root: Path, flat: bool) -> list[str]:
         for path in _entries(one.parent)
         if path.name.lower().replace(".yml", ".yaml") == one.name
     ]
+    misplaced = [(root / "plane", "images/plane/"), *((path, "logs/") for path in _listed(root, _LOGS))]
+    said += [
+        f"{_named(path, root)}: was left out, expected in {to}" for path, to in misplaced if path.exists()
+    ]
     folders = [path for path in _entries(root / "images") if path.is_dir()]
     strange = [path for path in folders if path.name.lower() not in ("plane", "dropped")]
     if strange:
@@ -174,11 +180,11 @@ def _names(paths: Iterable[Path]) -> str:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What a person sees in a folder."""
+    """What a person sees in a folder; ~$ begins what Office leaves of a table that is open."""
     if not folder.is_dir():
         return []
     with to_be("listed", folder):
-        found = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        found = [path for path in folder.iterdir() if not path.name.startswith((".", "~$"))]
     return sorted(found, key=lambda path: path.name)
 
 

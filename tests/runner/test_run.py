@@ -406,20 +406,24 @@ def test_logs_of_a_bending_arm_are_told_their_verb(tmp_path: Path) -> None:
 def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
     root = make_folder(tmp_path / "rig")
     assert read_folder(root).left_out == ()
-    for name in ("images/day1", "images/dropped", "logs/tag1", "logs/.git", "notes"):
+    for name in ("images/day1", "images/dropped", "logs/tag1", "logs/.git", "notes", "plane"):
         (root / name).mkdir()
     for name in (
         "logs/swing1.txt",
         "logs/columns.yaml",
         "logs/one.columns.yaml",
+        "logs/~$one.csv",
         "images/Thumbs.db",
         "rig.yml",
+        "swing2.csv",
     ):
         (root / name).write_text("")
     (root / "logs" / "states.csv").write_text(f"{','.join(STATES)}\n")
     read = read_folder(root)
     assert [sentence.split(" left out")[0] for sentence in read.left_out] == [
         "rig.yml: was",
+        "plane: was",
+        "swing2.csv: was",
         "images/: day1",
         "logs/: swing1.txt, tag1",
         "logs/: states that calib replay has written,",
