@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.core.command import one_command
-from calib.core.errors import BadInputError, UsageError
+from calib.core.errors import BadInputError, SomeFailedError, UsageError
 from calib.core.options import options_of
 from calib.core.stage import AnyStage, Files
 
@@ -60,7 +60,7 @@ def expanded(sources: Any) -> tuple[Path, ...]:
         text = str(sources)
         if not glob.has_magic(text) or Path(text).exists():
             return (Path(text),)
-        matches = sorted(glob.glob(text))  # noqa: PTH207  a pattern may be absolute
+        matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207  a pattern may be absolute
         if not matches:
             raise BadInputError(f"{text}: matches no file")
         return tuple(Path(one) for one in matches)
@@ -90,14 +90,24 @@ def function(name: str) -> Callable[..., Any]:
         paths = expanded(sources)
         if made.sources and not made.optional and not paths:
             raise UsageError(f"{name}: found no paths; it takes: {made.sources}")
+        told = list[str]()
+
+        def narrate(sentence: str) -> None:
+            told.append(sentence)
+            logging.getLogger("calib").info(sentence)
+
         files = Files(
             paths,
             output=None if output is None else Path(output),
-            narrate=logging.getLogger("calib").info,
+            narrate=narrate,
         )
         with one_command(files.paths):
             outcome = made.run(files, rig, options_of(made.options, options))
-        files.finish()
+        try:
+            files.finish()
+        except SomeFailedError as error:
+            why = [one for one in told if any(path.name in one for path in files.failed)]
+            raise SomeFailedError("; ".join([str(error), *why]), error.exit_code) from None
         return outcome[0] if isinstance(outcome, list) and len(outcome) == 1 else outcome
 
     def call_without_sources(rig: Rig | None = None, **options: Any) -> Any:

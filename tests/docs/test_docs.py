@@ -30,7 +30,7 @@ from calib.cli.docs import MANUAL, docs, manual, page_of, slug, write_manual
 from calib.cli.simulate import simulate
 from calib.core.arrays import points_of
 from calib.core.bounded_yaml import load
-from calib.core.errors import DISTRIBUTION, UsageError, pip_install
+from calib.core.errors import DISTRIBUTION, SomeFailedError, UsageError, pip_install
 from calib.core.rig import KINDS
 from calib.io.columns import COLUMNS, STATES
 from calib.stages import expanded
@@ -121,6 +121,8 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     assert set(names["calib"].plots(states)) == {
         f"ellipse_{one}" for one in ("states", "innovations", "errors")
     }
+    with pytest.raises(SomeFailedError, match=r"1 of 2 files failed: no\.csv; no\.csv: cannot be read"):
+        names["calib"].replay(["logs/ellipse.csv", "no.csv"], rig)
     again = names["calib"].Log.load("simulated.csv")
     assert len(again) == len(names["log"]) and "true_phi_rad" in again.columns
 
@@ -150,8 +152,10 @@ def test_what_a_function_cannot_take_is_one_sentence(call: Callable[[], object],
 
 
 def test_paths_may_come_from_a_generator(tmp_path: Path) -> None:
-    for name in ("a.csv", "b.csv"):
+    (tmp_path / "day1" / "logs").mkdir(parents=True)
+    for name in ("a.csv", "b.csv", "day1/logs/c.csv"):
         (tmp_path / name).touch()
+    assert expanded(f"{tmp_path}/**/c.csv") == (tmp_path / "day1/logs/c.csv",)
     assert set(expanded(tmp_path.glob("*.csv"))) == {tmp_path / "a.csv", tmp_path / "b.csv"}
 
 
