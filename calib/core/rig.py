@@ -106,6 +106,9 @@ class Geometry(Section):
     imu_sign: Annotated[list[Literal[-1, 1]], Field(min_length=3, max_length=3)] | None = None
     """Signs by which the board multiplies ax, ay and gz as its IMU gives them, of one that is mirrored."""
 
+    imu_delay_s: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
+    """Age of the IMU's readings, as of its low-pass: of a second order .225 over its bandwidth."""
+
     @field_validator("workspace_m")
     @classmethod
     def _ordered(cls, value: list[float]) -> list[float]:
@@ -372,6 +375,11 @@ class Rig:
         shift = 1e-3 * largest / math.sqrt(2.0)
         aside = min((self.geometry or Geometry()).marker_offset_sigma_m, _MOST_ASIDE_M)
         return math.hypot(shift, aside), shift
+
+    @property
+    def imu_delay_s(self) -> float:
+        """Age of the IMU's readings."""
+        return self.geometry.imu_delay_s if self.geometry is not None else 0.0
 
     @property
     def middle_m(self) -> tuple[float, float]:

@@ -574,8 +574,8 @@ class Drive(Machine):
         """All of it for the compiled functions."""
         return Model(
             *self.start(setup), self.numbers(), self.walk(setup), setup.view, self.noise(setup),
-            setup.bellows_radius_m, setup.delay_s, self.pump.delay_ticks * self.pump.tick_s,
-            setup.command_period_s, self.sigma[1],
+            setup.bellows_radius_m, setup.delay_s, setup.imu_delay_s,
+            self.pump.delay_ticks * self.pump.tick_s, setup.command_period_s, self.sigma[1],
         )  # fmt: skip
 
 
@@ -594,7 +594,8 @@ class Model(NamedTuple):
 
     Attributes
     ----------
-    delay : of pictures [s]. action : how long after its tick a command acts [s]. period : as in `give`.
+    delay, imu_delay : of pictures and of the IMU's readings [s]. action : how long after its tick a command
+        acts [s]. period : as in `give`.
     hoses_sigma : deviation of the logarithm of the damping once the hoses are on. radius : of a bellows [m].
     """
 
@@ -606,6 +607,7 @@ class Model(NamedTuple):
     noise: FloatArray
     radius: float
     delay: float
+    imu_delay: float
     action: float
     period: float
     hoses_sigma: float
@@ -1069,7 +1071,7 @@ def _due(
     if turn == 2:
         if not kinds & 2:
             return -1, 0.0
-        when = advance(memory.imu_clock, stamp)
+        when = advance(memory.imu_clock, stamp) - model.imu_delay
         z[0], z[1], z[2], z[3] = readings[2], readings[3], readings[4], memory.imu_clock[3]
         if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
             return -1, 0.0

@@ -530,6 +530,7 @@ class Setup:
     process : bank of levels.
     camera_period_s, imu_period_s : nominal; NaN takes the stamps as they are.
     command_period_s : of the commands; NaN where each holds until the next, however long.
+    imu_delay_s : age of the IMU's readings.
     """
 
     view: FloatArray
@@ -540,6 +541,7 @@ class Setup:
     camera_period_s: float = math.nan
     imu_period_s: float = math.nan
     command_period_s: float = math.nan
+    imu_delay_s: float = 0.0
 
     @property
     def delay_s(self) -> float:
@@ -550,7 +552,7 @@ class Setup:
     def ring(self) -> int:
         """How many of the last events a filter keeps: those since the exposure of a late picture."""
         period = self.imu_period_s if self.imu_period_s > 0.0 else 0.002
-        return min(max(16, math.ceil(2.0 * (self.delay_s + 0.02) / period) + 8), 512)
+        return min(max(16, math.ceil(2.0 * (max(self.delay_s, self.imu_delay_s) + 0.02) / period) + 8), 512)
 
 
 @dataclass(frozen=True)
@@ -860,7 +862,7 @@ class _Memory(NamedTuple):
 
 class _Model(NamedTuple):
     """What does not change, as in `bank_event`; prior (20,) of head and sensors and its deviations, radius
-    of a bellows, delay of pictures [s].
+    of a bellows, delays of pictures and of the IMU's readings [s].
     """
 
     switch_hz: float
@@ -872,6 +874,7 @@ class _Model(NamedTuple):
     prior_sigma: FloatArray
     radius: float
     delay: float
+    imu_delay: float
 
 
 class _Room(NamedTuple):
@@ -976,7 +979,7 @@ def run_filter(
                     continue
                 real[_CAMERA_SEEN] = stamp
             else:
-                when, late2 = advance(memory.imu_clock, stamp), memory.imu_clock[3]
+                when, late2 = advance(memory.imu_clock, stamp) - model.imu_delay, memory.imu_clock[3]
                 z0, z1, z2 = readings[row, 2], readings[row, 3], readings[row, 4]
                 if math.isnan(z2) and (math.isnan(z0) or math.isnan(z1)):
                     continue
@@ -1061,6 +1064,7 @@ class Filter:
         self._model = _Model(
             setup.process.switch_hz, levels, walk, setup.view, setup.noise, prior[0],
             np.sqrt(np.diag(covariance[0])), setup.bellows_radius_m, setup.delay_s,
+            setup.imu_delay_s,
         )  # fmt: skip
         self._room = _Room(
             np.empty((len(levels), *WORK)), np.zeros((len(levels), 7)), np.empty(len(REPORT)),

@@ -311,6 +311,9 @@ def _from_align(rig: Rig) -> tuple[dict[str, tuple[float, float]], FloatArray | 
     covariance = (
         None if align.covariance is None else _covariance(align.covariance, sigmas, _between_logs(rig))
     )
+    # Logs tell how much older a picture is than the readings of the IMU.
+    offset_s, sigma_s = values["time_offset_s"]
+    values["time_offset_s"] = (offset_s + rig.imu_delay_s, sigma_s)
     return values, covariance, said
 
 
@@ -488,7 +491,7 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
         view, _noise(rig, found), start, plant.bellows_radius_m, process=_process(rig),
         camera_period_s=found.camera_s if found.camera_even else math.nan,
         imu_period_s=found.imu_s if found.imu_even else math.nan,
-        command_period_s=found.command_s,
+        command_period_s=found.command_s, imu_delay_s=rig.imu_delay_s,
     )  # fmt: skip
     return setup, said
 

@@ -87,6 +87,7 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
     exposed, camera_s2 = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
     exposed = exposed - setup.delay_s
     taken, imu_s2 = even_times(new_clock(setup.imu_period_s), rows.t_s[imu])
+    taken = taken - setup.imu_delay_s
     seen = np.isfinite(rows.readings[camera, :2]).all(axis=1)
     camera, exposed = camera[seen], exposed[seen]
     pixels = np.full((len(camera), 4), np.nan)
