@@ -269,6 +269,17 @@ def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
     assert odd.held_rms(LAG, odd.main_group.files) < odd.held_rms(LAG)
 
 
+def test_the_lag_of_runs_that_end_on_their_way_is_poor_where_it_is_no_lag(found: PumpFound) -> None:
+    full = tuple(replace(r, pwm=np.full_like(r.pwm, 255.0)) for r in found.records)
+    flow = {LAG: found.held[ORIFICE], ORIFICE: found.held[LAG]}
+    for one, told in (
+        (replace(found, records=full, held=flow), True),
+        (replace(found, records=full), False),
+        (replace(found, held=flow), False),
+    ):
+        assert any("the runs end at" in text for text in judge_pump(one).reasons) == told
+
+
 def _write(path: Path, head: str, rows: np.ndarray) -> Path:
     lines = [",".join("" if c != c else f"{c:.6g}" for c in row) for row in rows.tolist()]
     path.write_text("\n".join([head, *lines]) + "\n")

@@ -1074,6 +1074,8 @@ _MOST_VAGUE = 0.5
 _PASSAGE = ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
 """What may be vague: parts of the passage make up for each other."""
 _WRITTEN = ("lag_s", "dead_time_s")
+_SETTLED = 0.95
+"""Runs of a pump behind an orifice that end there have a lag a seventh longer than settled ones."""
 
 
 def unexplained(found: PumpFound) -> list[Finding]:
@@ -1161,6 +1163,15 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
                 f"{name} of the {model} is {known}: {value:.3g} +- {sigma:.2g}",
                 "record steps of the PWM up and down, from rest, at 50 Hz or more",
             )
+    most = found.fits[LAG].values["level"]
+    ends = [float(np.median(r.value[-5:])) for r in found.records if _near_full(r) is not None]
+    if better != LAG and ends and max(ends) < _SETTLED * most:
+        yield Finding(
+            "poor",
+            f"the runs end at {100.0 * max(ends) / most:.0f} % of the {most:.3g} {found.unit} at which the "
+            f"{LAG} settles, and the {better} meets them better: lag and delay are those of that part alone",
+            "record each run until its value stays",
+        )
     settles = found.settles(better)
     if settles is not None:
         level, half, inside, count = settles
