@@ -124,7 +124,15 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
             logs.append(LogFile(path, name, columns_of(path, options), _kind(path.name)))
     own = root / "rig.yaml"
     rig = own if own.is_file() and taken(own) else None
-    left_out += _passed_over(root, flat)
+    beside = [
+        path
+        for path in _listed(root, _LOGS)
+        if path.is_file()
+        and not path.is_symlink()
+        and columns_of(path, options)
+        and not STATES_FILE.ours(path)
+    ]
+    left_out += _passed_over(root, flat, beside)
     if states:
         left_out.append(f"logs/: states that calib replay has written, left out: {_names(states)}")
     if arms := [log.path for log in logs if is_arm_log(log.columns or ())]:
@@ -147,8 +155,9 @@ def _pictures(folder: Path, taken: Callable[[Path], bool]) -> tuple[tuple[Path, 
     return pictures, board if board.exists() and taken(board) else None
 
 
-def _passed_over(root: Path, flat: bool) -> list[str]:
-    """Sentences on files and folders that a person may have meant to be read."""
+def _passed_over(root: Path, flat: bool, logs: Iterable[Path]) -> list[str]:
+    """Sentences on files and folders that a person may have meant to be read, `logs` outside of logs/ too."""
+    misplaced = [(root / "plane", "images/plane/"), *((path, "logs/") for path in logs)]
     names = ["images", "logs", "rig.yaml", "images/plane", "images/board.yaml", "images/plane/board.yaml"]
     meant = [root / name for name in (*names, *(["board.yaml"] if flat else []))]
     said = [
@@ -158,7 +167,6 @@ def _passed_over(root: Path, flat: bool) -> list[str]:
         for path in _entries(one.parent)
         if path.name.lower().replace(".yml", ".yaml") == one.name
     ]
-    misplaced = [(root / "plane", "images/plane/"), *((path, "logs/") for path in _listed(root, _LOGS))]
     said += [
         f"{_named(path, root)}: was left out, expected in {to}" for path, to in misplaced if path.exists()
     ]

@@ -418,7 +418,10 @@ def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
         "swing2.csv",
     ):
         (root / name).write_text("")
-    (root / "logs" / "states.csv").write_text(f"{','.join(STATES)}\n")
+    for name in ("logs/states.csv", "states.csv"):
+        (root / name).write_text(f"{','.join(STATES)}\n")
+    (root / "swing2.csv").write_text("t_s,gz_radps\n0.0,0.1\n0.01,0.1\n")
+    (root / "weights.csv").write_text("mass_g,elongation_mm\n0.0,0.1\n")
     read = read_folder(root)
     assert [sentence.split(" left out")[0] for sentence in read.left_out] == [
         "rig.yml: was",
