@@ -31,6 +31,7 @@ from calib.stages.align.solve import (
     Noise,
     Problem,
     Stretch,
+    _accelerations_at,
     _centred,
     align,
     best_jitter_px,
@@ -290,6 +291,18 @@ def _low_passed(log: AlignLog, held: tuple[float, float, float] | None) -> Align
         before = sosfilt_zi(sections) * (held[axis] if held else readings[0, axis])
         readings[:, axis] = sosfilt(sections, readings[:, axis], zi=before)[0]
     return replace(log, imu_s=log.imu_s[4::10], readings=readings[4::10])
+
+
+def test_late_accelerations_are_taken_at_the_moments_of_the_rates() -> None:
+    """With one stamp for two readings, and where a log has none along one axis."""
+    t = 0.01 * np.arange(60)
+    t[30] = t[29]
+    readings = np.column_stack([9.0 + np.sin(20.0 * (t - 0.002)), np.full(60, np.nan), np.zeros(60)])
+    none = np.zeros((0, 2))
+    stretch = Stretch(0, none[:, 0], none, t, readings, Knots(0.0, 0.01, 60), none, none)
+    there = _accelerations_at(stretch, 0.002).readings
+    np.testing.assert_allclose(there[2:-2, 0], 9.0 + np.sin(20.0 * t[2:-2]), atol=1e-3)
+    assert np.isnan(there[:, 1]).all()
 
 
 def test_a_sensor_that_still_shows_the_hand_as_a_swing_begins_does_not_turn_the_angle() -> None:

@@ -1307,7 +1307,11 @@ def _accelerations_at(stretch: Stretch, late_s: float) -> Stretch:
     for k in range(2):
         known = np.isfinite(readings[:, k])
         t, values = stretch.imu_s[known], readings[known, k]
-        readings[known, k] = CubicSpline(t, values)(np.clip(t + late_s, t[0], t[-1]))
+        # Of readings with one stamp the first.
+        apart = np.diff(t, prepend=-math.inf) > 0.0
+        if apart.sum() > 1:
+            curve = CubicSpline(t[apart], values[apart])
+            readings[known, k] = curve(np.clip(t + late_s, t[0], t[-1]))
     return replace(stretch, readings=readings)
 
 
