@@ -106,7 +106,7 @@ class Geometry(Section):
     imu_sign: Annotated[list[Literal[-1, 1]], Field(min_length=3, max_length=3)] | None = None
     """Signs by which the board multiplies ax, ay and gz as its IMU gives them, of one that is mirrored."""
 
-    imu_delay_s: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
+    imu_delay_s: Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False, strict=True)] = 0.0
     """Age of the IMU's readings, as of its low-pass: of a second order .225 over its bandwidth."""
 
     @field_validator("workspace_m")
