@@ -7,7 +7,6 @@ import os
 import re
 import stat
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -20,14 +19,13 @@ from numba.core.caching import FunctionCache
 from numba.core.targetconfig import TargetConfig
 from numba.core.types import unliteral
 
-from calib.core.writing import try_lock
+from calib.core.writing import lock_within
 
 _Parameters = ParamSpec("_Parameters")
 _Returned = TypeVar("_Returned")
 
 # A large function takes 10 s on a fast machine, several times that on a small one.
 _LONGEST_WAIT_S = 300.0
-_LOOK_AGAIN_S = 0.02
 
 
 _PACKAGE = Path(__file__).parents[1]
@@ -96,9 +94,7 @@ class _CompiledOnce:
         with contextlib.suppress(OSError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self._path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)
-            end = time.monotonic() + _LONGEST_WAIT_S
-            while not try_lock(self._lock) and time.monotonic() < end:
-                time.sleep(_LOOK_AGAIN_S)
+            lock_within(self._lock, _LONGEST_WAIT_S)
 
     def _release(self) -> None:
         if self._lock is None:

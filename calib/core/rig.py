@@ -379,7 +379,7 @@ class Rig:
     @property
     def imu_delay_s(self) -> float:
         """Age of the IMU's readings."""
-        return self.geometry.imu_delay_s if self.geometry is not None else 0.0
+        return (self.geometry or Geometry()).imu_delay_s
 
     @property
     def middle_m(self) -> tuple[float, float]:

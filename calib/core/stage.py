@@ -72,7 +72,7 @@ class Files:
     remarks : sentences on what was read, which are narrated once all of it is.
     written : names of the files that the outcome was written to beside rig.yaml.
     merged : sections whose earlier values go into the outcome as they are.
-    failed : by the path of a file that could not be worked on, the exit code that it alone would have.
+    failed : by the path of a file that could not be worked on, the exit code it alone would have, and why.
     left_out : why a file that a person named cannot be used beside others, by its path.
     """
 
@@ -85,7 +85,7 @@ class Files:
     remarks: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
     merged: tuple[str, ...] = ()
-    failed: dict[Path, int] = field(default_factory=dict)
+    failed: dict[Path, tuple[int, str]] = field(default_factory=dict)
     left_out: dict[Path, BadInputError] = field(default_factory=dict)
     figures: bool = True
     keep: bool = True
@@ -109,7 +109,7 @@ class Files:
         if len(self.paths) < 2:
             raise error
         self.narrate(words)
-        self.failed[path] = exit_code
+        self.failed[path] = exit_code, words
 
     def finish(self) -> None:
         """End the work, whose outcome has been told. Raises `SomeFailedError` where files have failed."""
@@ -117,7 +117,7 @@ class Files:
             names = ", ".join(shown(path.name) for path in self.failed)
             raise SomeFailedError(
                 f"{len(self.failed)} of {len(self.named)} files failed: {names}",
-                max(self.failed.values()),
+                max(code for code, _ in self.failed.values()),
             )
 
     def leave_out(self, error: BadInputError) -> bool:
@@ -311,7 +311,7 @@ class Stage(Generic[*Inputs]):
         if not judged:
             for path, error in files.left_out.items():
                 files.narrate(str(error))
-                files.failed[path] = error.exit_code
+                files.failed[path] = error.exit_code, str(error)
 
     def sections(self, outcome: Any) -> dict[str, Result]:
         """The sections of rig.yaml that an outcome holds, by name."""

@@ -61,8 +61,8 @@ _OTHERS = frozenset(
 )  # fmt: skip
 """Endings that promise some kind of file; under any other a file may be of each kind."""
 
-_TURN_S = 10.0
-"""Longer than any file is written, unless its process was stopped."""
+_LOOK_AGAIN_S, _TURN_S = 0.02, 10.0
+"""Between two looks at a lock, and longer than any file is written, unless its process was stopped."""
 RIG_FILE = "rig.yaml"
 """The name that is left to the sections of a rig."""
 
@@ -402,15 +402,22 @@ def try_lock(descriptor: int) -> bool:
     return True
 
 
+def lock_within(descriptor: int, longest_s: float) -> None:
+    """As `try_lock`, waiting for another process that has the lock, but not for ever."""
+    until = time.monotonic() + longest_s
+    while not try_lock(descriptor) and time.monotonic() < until:
+        time.sleep(_LOOK_AGAIN_S)
+
+
 @contextlib.contextmanager
 def one_at_a_time(path: Path) -> Iterator[None]:
     """Read, change and write a file while no other process does; only where folders can be locked."""
-    descriptor, until = None, time.monotonic() + _TURN_S
+    descriptor = None
     with contextlib.suppress(OSError):
         descriptor = os.open(_target(path).parent, os.O_RDONLY)
     try:
-        while descriptor is not None and not try_lock(descriptor) and time.monotonic() < until:
-            time.sleep(0.01)
+        if descriptor is not None:
+            lock_within(descriptor, _TURN_S)
         yield
     finally:
         if descriptor is not None:

@@ -21,7 +21,7 @@ from calib.core.workers import Failure, Processes, Task
 from calib.core.writing import make_folder
 from calib.runner.cache import Result, key_of, load, opened, remove, store
 from calib.runner.folder import Folder, LogFile, folder_digests, with_beside
-from calib.runner.work import perform
+from calib.runner.work import perform, stamp
 from calib.stages import stage
 
 # ----------------------------------------------------------------------
@@ -267,14 +267,6 @@ def opened_run(out: Path, folder: Path | None) -> Iterator[int | None]:
         yield interrupted
 
 
-def _stamp(path: Path) -> tuple[int, int, int]:
-    try:
-        status = path.stat()
-    except OSError:
-        return (-1, 0, 0)
-    return status.st_size, status.st_mtime_ns, status.st_ino
-
-
 @dataclass
 class Runner:
     """A run of a folder into an opened output folder.
@@ -297,13 +289,13 @@ class Runner:
     _base: Rig = field(default_factory=Rig)
     _learnt: dict[str, Rig] = field(default_factory=dict)
     _digests: dict[Path, str] = field(default_factory=dict)
-    _before: dict[Path, tuple[int, int, int]] = field(default_factory=dict)
+    _before: dict[Path, tuple[int, int, int] | None] = field(default_factory=dict)
     _began: dict[str, float] = field(default_factory=dict)
 
     def run(self) -> list[Job]:
         """Run all jobs; returns how they ended, in the table's order."""
         jobs = list(jobs_of(self.folder, self.steps))
-        self._before = {path: _stamp(path) for path in self.folder.files()}
+        self._before = {path: stamp(path) for path in self.folder.files()}
         self._digests = folder_digests(self.folder)
         if self._of_others():
             self.tell(f"{shown(self.out)}: held the results of other pictures and logs, which these replace")
@@ -414,7 +406,7 @@ class Runner:
 
     def _stored(self, job: Job, key: str, code: int) -> Job:
         """A job that has come to its end, its result kept."""
-        changed = next((path for path in job.inputs if _stamp(path) != self._before[path]), None)
+        changed = next((path for path in job.inputs if stamp(path) != self._before[path]), None)
         if changed is not None:
             name = one_line(self.folder.name_of(changed))
             return replace(job, status="failed", reason=f"{name} changed while it was read; run it again")

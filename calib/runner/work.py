@@ -67,7 +67,7 @@ def _carried_out(
     # A name that a person has mistyped is no empty rig for a stage that lives on its sections.
     of_data = made.writes_rig(options) and bool(made.sources) and not made.needs
     may_begin = of_data or (rig_path.name == RIG and rig_path.parent.is_dir())
-    before = _stamp(rig_path)
+    before = stamp(rig_path)
     rig = Rig.load(rig_path, missing_ok=may_begin)
     try:
         outcome = made.run(files, rig, options)
@@ -79,7 +79,7 @@ def _carried_out(
     sections = made.sections(outcome)
     if sections:
         with one_at_a_time(rig_path):
-            if _stamp(rig_path) not in (before, None):
+            if stamp(rig_path) not in (before, None):
                 # What a person or another command has written meanwhile stays.
                 rig = Rig.load(rig_path)
             rig = rig.with_sections(sections)
@@ -97,13 +97,13 @@ def _carried_out(
     return outcome, rig
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def stamp(path: Path) -> tuple[int, int, int] | None:
     """What changes with a file; None for none."""
     try:
         status = path.stat()
     except OSError:
         return None
-    return status.st_ino, status.st_mtime_ns
+    return status.st_size, status.st_mtime_ns, status.st_ino
 
 
 def perform(

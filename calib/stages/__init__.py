@@ -90,23 +90,17 @@ def function(name: str) -> Callable[..., Any]:
         paths = expanded(sources)
         if made.sources and not made.optional and not paths:
             raise UsageError(f"{name}: found no paths; it takes: {made.sources}")
-        told = list[str]()
-
-        def narrate(sentence: str) -> None:
-            told.append(sentence)
-            logging.getLogger("calib").info(sentence)
-
         files = Files(
             paths,
             output=None if output is None else Path(output),
-            narrate=narrate,
+            narrate=logging.getLogger("calib").info,
         )
         with one_command(files.paths):
             outcome = made.run(files, rig, options_of(made.options, options))
         try:
             files.finish()
         except SomeFailedError as error:
-            why = [one for one in told if any(path.name in one for path in files.failed)]
+            why = (words for _, words in files.failed.values())
             raise SomeFailedError("; ".join([str(error), *why]), error.exit_code) from None
         return outcome[0] if isinstance(outcome, list) and len(outcome) == 1 else outcome
 

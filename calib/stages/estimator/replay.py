@@ -900,7 +900,7 @@ def replay_log(
     trace = sums.trace.values if sums.trace is not None else np.zeros((0, 0))
     name = estimator if not smoothed else "smoothed"
     # An actuator that its logs do not bear out is a model that errs, which moves the rest length as well.
-    if longer_m is not None and rig.actuator is not None and rig.actuator.verdict.word == "ok":
+    if fused and longer_m is not None and rig.actuator is not None and rig.actuator.verdict.ok:
         findings += grown(*longer_m)
     result = _replayed(log, name, sums, compared, sensor, findings)
     result.doubt(rig.doubts(_taken(log, drive is not None)))
