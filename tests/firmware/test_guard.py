@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from firmware_board import Board
 from firmware_build import Built, need, sketch, warnings, write
-from firmware_rigs import header
+from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
 from calib.io.serial import FAULTS as FAULT_WORDS
@@ -249,16 +249,37 @@ def test_every_fault_is_tried_by_the_self_test_in_all_builds(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "envelope",
+    ("envelope", "high_pwm"),
     [
-        {"angle_rad": 0.01, "apart_m": 0.0005, "rate_mps": 0.01, "full_power_s": 0.01, "open_loop_s": 0.01},
-        {"angle_rad": 0.08},
-        {"angle_rad": 1.5, "apart_m": 0.5, "rate_mps": 10.0, "full_power_s": 600.0, "open_loop_s": 600.0},
+        (
+            {
+                "angle_rad": 0.01,
+                "apart_m": 0.0005,
+                "rate_mps": 0.01,
+                "full_power_s": 0.01,
+                "open_loop_s": 0.01,
+            },
+            255,
+        ),
+        ({"angle_rad": 0.08, "open_loop_pwm": 1.0}, 100),
+        (
+            {"angle_rad": 1.5, "apart_m": 0.5, "rate_mps": 10.0, "full_power_s": 600.0, "open_loop_s": 600.0},
+            2,
+        ),
     ],
 )
-def test_the_self_test_passes_in_any_envelope(tmp_path: Path, envelope: dict[str, float]) -> None:
+def test_the_self_test_passes_in_any_envelope(
+    tmp_path: Path, envelope: dict[str, float], high_pwm: int
+) -> None:
     need("gcc")
-    write(tmp_path, header_of(Rig.of({"envelope": envelope}, "rig.yaml"), "rig.yaml"))
+    tuned = rig("full").controller
+    assert tuned is not None
+    whole = Rig.of({"envelope": envelope}, "rig.yaml").with_sections(
+        {"controller": tuned.model_copy(update={"pwm_low": 0.0, "pwm_high": float(high_pwm)})}
+    )
+    made_of = header_of(whole, "rig.yaml")
+    assert made_of.values["CALIB_ENVELOPE_OPEN_HIGH"] <= made_of.values["CALIB_PUMP_HIGH"] == high_pwm
+    write(tmp_path, made_of)
     (tmp_path / "guard.c").write_text(
         '#include "calib_guard.h"\nint main(void) { return calib_guard_selftest(); }\n'
     )

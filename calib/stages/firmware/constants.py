@@ -341,10 +341,11 @@ def _feed(lookup: Lookup, low_pwm: float) -> dict[str, Any]:
 def _limits(lookup: Lookup) -> tuple[float, float]:
     low = lookup.number("controller.pwm_low", PWM_MIN)
     high = lookup.number("controller.pwm_high", PWM_MAX)
-    if not low < high or high != round(high) or low != round(low):
+    # The guard's self-test commands 1 for a pump that is not at full power.
+    if not low < high or high < 2.0 or high != round(high) or low != round(low):
         raise BadInputError(
             f"{lookup.source}: controller.pwm_low and pwm_high are {low:g} and {high:g}, "
-            "expected rising whole numbers"
+            "expected whole numbers, the second at least 2 and above the first"
         )
     return low, high
 
@@ -372,9 +373,9 @@ def _envelope(
             f"{lookup.source}: envelope.least_length_m is {least:g}, expected less than the greatest, "
             f"{greatest:g}"
         )
-    # The command that holds both bellows at the greatest length, the greatest one where none does.
+    # The command that holds both bellows at the greatest length, the pumps' greatest where none does.
     reached = feed["first_m"] + _TABLE_STEP_M * np.arange(len(feed["pwm"]))
-    held = float(np.interp(greatest, reached, feed["pwm"], right=PWM_MAX))
+    held = min(max(float(np.interp(greatest, reached, feed["pwm"], right=PWM_MAX)), 1.0), pwm[1])
 
     def ticks(name: str, least_s: float = 0.0) -> int:
         # The guard's self-test needs three.

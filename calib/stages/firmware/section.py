@@ -30,8 +30,9 @@ class Envelope(Section):
     open_loop_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, strict=True)] = 60.0
     """Time that a pump may be on in open loop, less four times what it was off."""
 
-    open_loop_pwm: Annotated[float, Field(gt=0, le=255, allow_inf_nan=False, strict=True)] | None = None
-    """Greatest command in open loop. Default: what holds the greatest length by the pump's map."""
+    open_loop_pwm: Annotated[float, Field(ge=1, le=255, allow_inf_nan=False, strict=True)] | None = None
+    """Greatest command in open loop. Default: what holds the greatest length by the pump's map, at
+    most controller.pwm_high."""
 
     apart_m: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)] = 0.012
     """Distance of the marker from where the angle puts it."""

@@ -381,8 +381,8 @@ static inline void calib_trial_sound(calib_trial *of, uint8_t k) {
     of->out.marker_m[1] = CALIB_REST_LENGTH_M;
     of->out.q_m[0] = CALIB_ENVELOPE_LEAST_M;
     of->out.q_m[1] = CALIB_ENVELOPE_LEAST_M;
-    of->out.duty[0] = 100;
-    of->out.duty[1] = 100;
+    of->out.duty[0] = 1;
+    of->out.duty[1] = 1;
 }
 
 /* One tick of the guard. Whether a pump is on. */
