@@ -1,7 +1,9 @@
 """From logs of pressures and motion capture to trials on a regular grid, and what the recordings show.
 
-The tip's rotation in the frame of the base turns about one axis where the motion is planar: the direction of
-the largest spread of the rotation vectors. The angle is their part along it, and grows with bending.
+The tip's rotation in the frame of the base turns about one axis a where the motion is planar: the direction
+of the largest spread of the rotation vectors from a recording's mean pose to its others. The tip's body
+may be mounted in any way, q = exp(phi a / 2) m; a turn at the start that no resting arm has is m, taken off.
+The angle is the twist about the axis, 2 atan2(q . a, q_w), and grows with bending.
 A quaternion that maps the world to the body instead of the body to the world turns against the chord from
 base to tip.
 """
@@ -9,12 +11,12 @@ base to tip.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.io.columns import COMMANDED, POSITION, PRESSURES, PWM, QUATERNION
@@ -26,8 +28,14 @@ _FEWEST_S = 5.0
 _JUMP_RAD, _ALONE = math.radians(0.7), 3.0
 """A step between neighbours that is a jump, where it is so many times the usual one about it: an arm that
 turns at 60 deg/s makes as large ones at 90 Hz, one after the other."""
+_BACK_S, _BACK = 0.3, 0.5
+"""Motion capture that jumps and jumps back within this time, to less than this share of it, was wrong."""
+_MOUNTED_RAD = math.radians(60.0)
+"""A turn at the start that is a body's mount: no arm rests so far bent."""
 _TILTED_RAD = math.radians(5.0)
-_LEAST_TURN_RAD = math.radians(2.0)
+_LEAST_TURN_RAD = math.radians(0.5)
+_PLANE = 3.0
+"""Times its thickness that the path of a tip is wide, where it tells a plane."""
 _NO_PLANE_RAD = math.radians(45.0)
 _LONGEST_M, _MOST_KPA, _LEAST_KPA, _MOST_TURN_RAD = 3.0, 2000.0, 5.0, 2.0 * math.pi
 """No soft arm is so long, takes so much or rolls up twice; hardly one bends by so little a pressure."""
@@ -47,6 +55,9 @@ _TURNED_OFF_RAD = math.radians(45.0)
 _LEAST_SHARE = 0.1
 """Of the greatest change of a chamber, below which the change of another is noise."""
 
+_Between = Callable[[FloatArray, FloatArray], FloatArray]
+"""Distances (n,) between values (n, k)."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -55,7 +66,10 @@ class Frame:
     Attributes
     ----------
     axis : (3,) of the bending, in the frame of the base; None for poses in the plane.
-    grows : sign with which the angles of poses in the plane grow with bending.
+    grows, zero_rad : sign with which the angles of poses in the plane grow with bending, and from what they
+        are counted.
+    mount : (3,) rotation vector of the tip's body that is taken off in the frame of the base; 0 of one that
+        starts near the base's attitude.
     conjugated : whether quaternions map the world to the body.
     leans : turn of the chord over that of the tip.
     planar_deg : angle between the axis and the normal of the tip's path.
@@ -64,6 +78,8 @@ class Frame:
 
     axis: FloatArray | None
     grows: float = 1.0
+    zero_rad: float = 0.0
+    mount: Sequence[float] = (0.0, 0.0, 0.0)
     conjugated: bool = False
     leans: float = math.nan
     planar_deg: float = math.nan
@@ -78,9 +94,9 @@ class Recording:
     ----------
     command, pressure : (n,) kPa of the driven chamber, NaN where a cell is blank; None without. The command
         is a PWM value where `pwm`.
-    turned, chord : (2, n, 3) rotation vectors of the tip [rad], and from base to tip [m], in the frame of the
-        base: with the quaternions as they are, and conjugated. Both None for poses in the plane, or without
-        motion capture.
+    turned, chord : (2, n, 4) quaternions of the tip, w last, and (2, n, 3) from base to tip [m], in the frame
+        of the base: with the quaternions as they are, and conjugated. Both None for poses in the plane, or
+        without motion capture.
     planar : (n, 2) angle [rad] and chord [m] in the plane, None without.
     findings : on the sensors.
     """
@@ -98,7 +114,7 @@ class Recording:
 
 
 def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors and chords (2, n, 3) as in `Recording`, NaN in rows without a pose or of zeros.
+    """Quaternions and chords (2, n, ...) as in `Recording`, NaN in rows without a pose or of zeros.
 
     Raises `BadInputError` for quaternions that are none.
     """
@@ -119,13 +135,23 @@ def _poses(log: Log) -> tuple[FloatArray, FloatArray]:
     seen = np.isfinite(base).all(axis=1) & np.isfinite(tip).all(axis=1)
     if not seen.any():
         raise BadInputError(f"{log.source}: no row has poses of base and tip, expected both")
-    turned, chord = np.full((2, 2, len(tip), 3), np.nan)
+    turned, chord = (np.full((2, len(tip), size), np.nan) for size in (4, 3))
     first, last = (Rotation.from_quat(q[seen][:, [1, 2, 3, 0]]) for q in (base, tip))
     apart = np.stack([read[f"tip_{k}_m"] - read[f"base_{k}_m"] for k in "xyz"], axis=1)
     for way, (a, b) in enumerate([(first, last), (first.inv(), last.inv())]):
-        turned[way, seen] = (a.inv() * b).as_rotvec()
+        turned[way, seen] = (a.inv() * b).as_quat()
         chord[way, seen] = a.inv().apply(apart[seen])
     return turned, chord
+
+
+def _rotations_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Angles (n,) [rad] between quaternions (n, 4), whatever their signs."""
+    away = np.minimum(np.linalg.norm(first - second, axis=-1), np.linalg.norm(first + second, axis=-1))
+    return np.asarray(4.0 * np.arcsin(np.minimum(0.5 * away, 1.0)))
+
+
+def _distances_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(first - second, axis=-1))
 
 
 def _frozen(log: Log, name: str, driven: int) -> Iterator[Finding]:
@@ -175,12 +201,16 @@ def recording_of(log: Log, name: str) -> Recording:
     turned = chord = planar = None
     if all(one in log.columns for one in (*POSITION, *QUATERNION)):
         turned, chord = _poses(log)
-        findings += _jumps(log, name, turned[0], chord[0])
+        wrong, jumps = _jumps(log, name, turned[0], chord[0], _rotations_between)
+        turned[:, wrong], chord[:, wrong] = np.nan, np.nan
+        findings += jumps
     elif all(one in log.columns for one in _PLANAR):
         x, y, phi = (log.columns[one] for one in _PLANAR)
         apart = np.stack([x - log.columns.get("base_x_m", 0.0), y - log.columns.get("base_y_m", 0.0)], axis=1)
         planar = np.stack([phi, np.hypot(*apart.T)], axis=1)
-        findings += _jumps(log, name, phi[:, None], apart)
+        wrong, jumps = _jumps(log, name, np.stack([np.cos(phi), np.sin(phi)], axis=1), apart)
+        planar[wrong] = np.nan
+        findings += jumps
     command, pressure = (log.columns.get(names[driven]) for names in (COMMANDED, PRESSURES))
     pwm = command is None and driven < len(PWM) and PWM[driven] in log.columns
     if pwm:
@@ -280,28 +310,63 @@ def _in_units(recording: Recording) -> list[Finding]:
     return []
 
 
-def _jumps(log: Log, name: str, turned: FloatArray, apart: FloatArray) -> Iterator[Finding]:
-    """Steps of rotations (n, ...) [rad] and places (n, ...) [m] that no arm makes."""
+def _jumps(
+    log: Log, name: str, turned: FloatArray, apart: FloatArray, turns: _Between = _distances_between
+) -> tuple[BoolArray, list[Finding]]:
+    """Rows (n,) between jumps of rotations (n, k) or places (n, k) [m] there and back, and findings."""
+    length = float(np.nanmedian(np.linalg.norm(apart, axis=1))) if np.isfinite(apart).any() else math.inf
+    wrong, findings = np.zeros(len(apart), dtype=bool), []
+    for values, between, least, scale, unit in (
+        (turned, turns, _JUMP_RAD, math.degrees(1.0), "deg"),
+        (apart, _distances_between, _JUMP_SHARE * length, 1e3, "mm"),
+    ):
+        seen = np.flatnonzero(np.isfinite(values).all(axis=1))
+        steps = between(values[seen[1:]], values[seen[:-1]])
+        # What moves fast does so for several samples.
+        far = (steps > least) & (steps > _ALONE * _medians(steps, 5)) & (np.diff(seen) == 1)
+        if far.any():
+            first = int(np.argmax(far))
+            findings.append(
+                Finding(
+                    "remark",
+                    f"{name}, line {log.lines[seen[first + 1]]}: motion capture jumps by "
+                    f"{scale * steps[first]:.1f} {unit} from one sample to the next; {far.sum()} such jumps "
+                    "in all",
+                )
+            )
+        wrong[seen[_excursions(log.t_s[seen], values[seen], between, least)]] = True
+    if wrong.any():
+        findings.append(
+            Finding(
+                "remark",
+                f"{name}: {wrong.sum()} poses are left out, as motion capture jumps there and back within "
+                f"{_BACK_S:g} s",
+            )
+        )
+    return wrong, findings
+
+
+def _medians(steps: FloatArray, size: int) -> FloatArray:
     from scipy.ndimage import median_filter
 
-    step, moved = (np.linalg.norm(np.diff(one, axis=0), axis=1) for one in (turned, apart))
-    # What moves fast does so for several samples.
-    usual = (median_filter(np.nan_to_num(one), 5, mode="nearest") for one in (step, moved))
-    step, moved = (
-        np.where(one > _ALONE * by, one, 0.0) for one, by in zip((step, moved), usual, strict=True)
-    )
-    length = float(np.nanmedian(np.linalg.norm(apart, axis=1))) if np.isfinite(apart).any() else math.inf
-    for steps, least, scale, unit in (
-        (step, _JUMP_RAD, math.degrees(1.0), "deg"), (moved, _JUMP_SHARE * length, 1e3, "mm")
-    ):  # fmt: skip
-        far = np.nonzero(steps > least)[0]
-        if len(far):
-            yield Finding(
-                "remark",
-                f"{name}, line {log.lines[far[0] + 1]}: motion capture jumps by "
-                f"{scale * steps[far[0]]:.1f} {unit} from one sample to the next; {len(far)} such jumps "
-                "in all",
-            )
+    return np.asarray(median_filter(steps, min(size, max(len(steps), 1)), mode="nearest"))
+
+
+def _excursions(t: FloatArray, values: FloatArray, between: _Between, least: float) -> IntArray:
+    """Rows between a jump away and one back to where values (n, k) were, within `_BACK_S`."""
+    steps = between(values[1:], values[:-1])
+    usual = _medians(steps, 1 + 2 * round(0.5 * len(t) / max(t[-1] - t[0], 1.0)) if len(t) else 1)
+    jump = (steps > least) & (steps > _ALONE * usual)
+    out, after = [np.zeros(0, dtype=np.int64)], 0
+    for k in np.flatnonzero(jump).tolist():
+        if k < after:
+            continue
+        rows = np.arange(k + 1, int(np.searchsorted(t, t[k] + _BACK_S, side="right")))
+        back = (between(values[rows], values[k]) < _BACK * steps[k]) & jump[rows - 1]
+        if back.any():
+            after = int(rows[np.argmax(back)])
+            out.append(np.arange(k + 1, after))
+    return np.concatenate(out)
 
 
 def frame_of(recordings: Sequence[Recording]) -> Frame:
@@ -309,35 +374,57 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
 
     Of the two conventions that one is taken under which tip and chord turn the same way about the same axis.
 
-    Raises `BadInputError` where the tip turns by less than 2 deg.
+    Raises `BadInputError` where the tip hardly turns.
     """
+    angles = [one.planar[:, 0] for one in recordings if one.planar is not None]
+    sign, zero = 1.0, 0.0
+    if angles:
+        begin = _circular_mean(np.array([_first(one) for one in angles]))
+        zero = begin if abs(begin) > _MOUNTED_RAD else 0.0
+        sign = _grows([_continuous(one, zero) for one in angles])
     if all(one.turned is None for one in recordings):
-        return Frame(None, planar_sign(recordings))
+        return Frame(None, sign, zero)
     frames = [_frame(recordings, conjugated) for conjugated in (False, True)]
-    return max(frames, key=lambda one: math.copysign(math.cos(math.radians(one.planar_deg)), one.leans))
+    # A body that is mounted by half a turn looks the same either way.
+    best = max(
+        frames, key=lambda one: round(math.copysign(math.cos(math.radians(one.planar_deg)), one.leans), 2)
+    )
+    return replace(best, grows=sign, zero_rad=zero)
 
 
 def _frame(recordings: Sequence[Recording], conjugated: bool) -> Frame:
     """The frame under one convention, with a negative `leans` where the tip turns against its chord."""
-    parts = [
-        (one.turned[int(conjugated)], one.chord[int(conjugated)])
-        for one in recordings
-        if one.turned is not None and one.chord is not None
-    ]
-    turned, chord = (np.concatenate(of) for of in zip(*parts, strict=True))
-    seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
-    turned, chord = turned[seen], chord[seen]
-    values, axes = np.linalg.eigh(np.cov(turned.T))
+    from scipy.spatial.transform import Rotation
+
+    parts, starts, vectors = [], [], []
+    for one in recordings:
+        if one.turned is None or one.chord is None:
+            continue
+        turned, chord = one.turned[int(conjugated)], one.chord[int(conjugated)]
+        seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
+        turned, chord = turned[seen], chord[seen]
+        parts.append((turned, chord))
+        rotations = Rotation.from_quat(turned)
+        starts.append(rotations[: max(len(turned) // 100, 1)].mean())
+        away = (rotations * rotations.mean().inv()).as_rotvec()
+        vectors.append(away - away.mean(axis=0))
+    values, axes = np.linalg.eigh(np.cov(np.concatenate(vectors).T))
     axis = axes[:, -1]
     if math.sqrt(values[-1]) < _LEAST_TURN_RAD:
         raise BadInputError(
             f"{recordings[0].source}: the tip turns by {math.degrees(math.sqrt(values[-1])):.2g} deg (RMS), "
-            "expected the arm to bend"
+            f"expected the arm to bend by {math.degrees(_LEAST_TURN_RAD):g} deg at least"
         )
+    begin = Rotation.concatenate(starts).mean().as_rotvec()
+    mount = begin if np.linalg.norm(begin) > _MOUNTED_RAD else np.zeros(3)
+    chord = np.concatenate([one for _, one in parts])
     # About each recording's own middle, as the base's marker may be moved between days.
-    centred = np.concatenate([one - np.nanmean(one, axis=0) for _, one in parts])[seen]
-    _, paths = np.linalg.eigh(np.cov(centred.T))
+    wide, paths = np.linalg.eigh(np.cov(np.concatenate([one - one.mean(axis=0) for _, one in parts]).T))
     normal = paths[:, 0]
+    if wide[1] < _PLANE**2 * wide[0]:
+        # A path that is as good as straight lies in many planes.
+        normal = axis - paths[:, 2] * (paths[:, 2] @ axis)
+        normal /= np.linalg.norm(normal)
     planar = math.degrees(math.acos(min(abs(float(axis @ normal)), 1.0)))
     # Turn of the chord about the path's normal, against the tip's.
     first = np.median(chord[: max(len(chord) // 100, 1)], axis=0)
@@ -345,36 +432,63 @@ def _frame(recordings: Sequence[Recording], conjugated: bool) -> Frame:
     normal = normal if normal @ axis > 0.0 else -normal
     side = np.cross(normal, first)
     heading = np.arctan2(chord @ side, chord @ first)
-    angle = turned @ axis
-    leans, offset = np.polyfit(angle, heading, 1)
+    angles = [_twist(one, axis, mount) for one, _ in parts]
+    leans, offset = np.polyfit(np.concatenate(angles), heading, 1)
     straight = first * math.cos(offset) + side * math.sin(offset)
     return Frame(
         # The angle grows with bending, whatever way that is.
-        _grows(angle) * axis,
-        planar_sign(recordings),
-        conjugated,
-        float(leans),
-        planar,
-        straight / np.linalg.norm(straight),
+        _grows(angles) * axis,
+        mount=mount.tolist(),
+        conjugated=conjugated,
+        leans=float(leans),
+        planar_deg=planar,
+        direction=straight / np.linalg.norm(straight),
     )
 
 
-def _grows(angle_rad: FloatArray) -> float:
-    """The sign with which angles (n,) grow with bending."""
-    low, high = np.nanpercentile(angle_rad, (1.0, 99.0))
-    return -1.0 if -low > high else 1.0
+def _twist(turned: FloatArray, axis: FloatArray, mount: FloatArray | Sequence[float]) -> FloatArray:
+    """Angle (n,) [rad] about an axis (3,) of rotations (n, 4) from a mount (3,), NaN where they are."""
+    from scipy.spatial.transform import Rotation
+
+    seen = np.isfinite(turned).all(axis=1)
+    q = (Rotation.from_quat(turned[seen]) * Rotation.from_rotvec(mount).inv()).as_quat()
+    out = np.full(len(turned), np.nan)
+    out[seen] = 2.0 * np.arctan2(q[:, :3] @ axis, q[:, 3])
+    return _continuous(out)
 
 
-def planar_sign(recordings: Sequence[Recording]) -> float:
-    """The sign with which the angles of poses in the plane grow with bending; 1 without any."""
-    angles = [one.planar[:, 0] for one in recordings if one.planar is not None]
-    return _grows(np.concatenate(angles)) if angles else 1.0
+def _circular_mean(angles_rad: FloatArray) -> float:
+    return float(np.angle(np.nanmean(np.exp(1j * angles_rad))))
+
+
+def _continuous(angles_rad: FloatArray, zero_rad: float = 0.0) -> FloatArray:
+    """Angles (n,) from a zero, within half a turn of their mean, the first ones within half a turn of 0."""
+    if not np.isfinite(angles_rad).any():
+        return angles_rad
+    mean = _circular_mean(angles_rad)
+    out = mean - zero_rad + np.remainder(angles_rad - mean + math.pi, math.tau) - math.pi
+    return np.asarray(out - math.tau * round(_first(out) / math.tau))
+
+
+def _first(angles_rad: FloatArray) -> float:
+    """Median of the first hundredth of the angles (n,) that are there."""
+    seen = angles_rad[np.isfinite(angles_rad)]
+    return float(np.median(seen[: max(len(seen) // 100, 1)])) if len(seen) else 0.0
+
+
+def _grows(recordings_rad: Sequence[FloatArray]) -> float:
+    """The sign with which angles, an array (n,) of each recording from rest, grow with bending."""
+    ranges = [(*np.nanpercentile(one, (1.0, 99.0)), _first(one)) for one in recordings_rad if len(one)]
+    return -1.0 if sum(low + high - 2.0 * first for low, high, first in ranges) < 0.0 else 1.0
 
 
 def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
     """Raise `BadInputError` for poses that turn about another axis than that of an identified arm."""
     for one in recordings:
-        if frame.axis is None or one.turned is None or _range(one.turned[0]) < 4.0 * _LEAST_TURN_RAD:
+        if frame.axis is None or one.turned is None:
+            continue
+        angles = _twist(one.turned[int(frame.conjugated)], frame.axis, frame.mount)
+        if _range(angles) < 4.0 * _LEAST_TURN_RAD:
             continue
         axis = _frame([one], frame.conjugated).axis
         off = 0.0 if axis is None else math.acos(min(max(float(axis @ frame.axis), -1.0), 1.0))
@@ -391,6 +505,13 @@ def frame_findings(frame: Frame) -> Iterator[Finding]:
     if frame.grows < 0.0:
         yield Finding(
             "remark", "tip_phi_rad falls as the arm bends; the angle is counted as it grows with bending"
+        )
+    mounted = max(abs(frame.zero_rad), float(np.linalg.norm(frame.mount)))
+    if mounted > 0.0:
+        yield Finding(
+            "remark",
+            f"the tip starts turned by {math.degrees(mounted):.0f} deg against the base, as it is mounted: "
+            "the angle counts from there",
         )
     if frame.axis is None or frame.direction is None:
         return
@@ -438,12 +559,13 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
     unseen = None
     if recording.turned is not None and recording.chord is not None and frame.axis is not None:
         turned = recording.turned[int(frame.conjugated)]
-        angle = _between(grid, t, turned @ frame.axis)
+        angle = _between(grid, t, _twist(turned, frame.axis, frame.mount))
         chord = _between(grid, t, np.linalg.norm(recording.chord[0], axis=1))
         unseen = _gaps(grid, t, turned)
     elif recording.planar is not None:
-        angle, chord = (_between(grid, t, column) for column in recording.planar.T)
-        angle = frame.grows * angle
+        angles, chords = recording.planar.T
+        angle = frame.grows * _between(grid, t, _continuous(angles, frame.zero_rad))
+        chord = _between(grid, t, chords)
         unseen = _gaps(grid, t, recording.planar)
     command = none if recording.command is None else _means(grid, t, recording.command)
     if not len(pressure) and not len(angle):

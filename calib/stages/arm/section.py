@@ -33,6 +33,9 @@ class Arm(Result):
         factor of bends_rad_per_kpa alone.
     bending_axis : in the frame of the base; absent for poses in the plane.
     conjugated : whether the logs' quaternions map the world to the body.
+    tip_mount : rotation vector of the tip's body in the frame of the base that is taken off, 0 of one that
+        starts near the base's attitude.
+    tip_zero_rad, tip_grows : of poses in the plane, from what angle they count and with what sign they grow.
     interval_rad : half the 95 % interval of the angle of a further trial, from the errors on held trials.
     coverage : share of the samples of held trials inside the interval that the others' errors give.
     held : free-run errors on each trial from a fit to the others.
@@ -45,6 +48,9 @@ class Arm(Result):
     days: dict[str, dict[str, Positive]] = {}
     bending_axis: Row3 | None = None
     conjugated: bool = False
+    tip_mount: Row3 = [0.0, 0.0, 0.0]
+    tip_zero_rad: Number = 0.0
+    tip_grows: Number = 1.0
     chord_leans: NotNegative | None = quantity(None, label="chord's turn, of the tip's", digits=2)
     angle_error_rad: NotNegative | None = quantity(
         None, label="angle of a held trial", show="deg", digits=2, fact=True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
@@ -86,7 +86,6 @@ def read_trials(
         check_frame,
         frame_findings,
         frame_of,
-        planar_sign,
         recording_of,
         trial_of,
     )
@@ -102,11 +101,9 @@ def read_trials(
     for path in files.paths:
         recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
         files.taken(path)
-    if frame is None:
-        found = frame_of(recordings)
-    else:
+    found = frame_of(recordings) if frame is None else frame
+    if frame is not None:
         check_frame(recordings, frame)
-        found = replace(frame, grows=planar_sign(recordings))
     trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
     loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items() if name in used) or "none"
     files.remarks.append(f"days: {', '.join(sorted({days[name] for name in used}))}; loads: {loaded}")
@@ -140,6 +137,9 @@ def _solve(
         days={day: dict(factors) for day, factors in made.days.items()},
         bending_axis=None if axis is None else axis.tolist(),
         conjugated=frame.conjugated,
+        tip_mount=list(frame.mount),
+        tip_zero_rad=frame.zero_rad,
+        tip_grows=frame.grows,
         chord_leans=finite_or_none(abs(frame.leans)),
         angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
         chord_error_m=finite_or_none(mean_of(found.held, "chord_m")),
@@ -335,7 +335,13 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
             "--load: the arm in the rig's file has no part load, expected one that was identified from a log "
             "with a load too"
         )
-    frame = Frame(None if axis is None else np.array(axis), conjugated=arm.conjugated)
+    frame = Frame(
+        None if axis is None else np.array(axis),
+        arm.tip_grows,
+        arm.tip_zero_rad,
+        arm.tip_mount,
+        arm.conjugated,
+    )
     trials, _, findings = read_trials(files, options, frame)
     files.remarks += [one.text for one in findings]
     files.remarks += [
