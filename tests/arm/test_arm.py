@@ -12,7 +12,7 @@ import pytest
 from armtrials import SCALE, TRUE, columns_of, simulated
 from scipy.spatial.transform import Rotation
 
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.columns import known_name
@@ -198,6 +198,14 @@ def _log(columns: dict[str, FloatArray], trial: Trial) -> Log:
     return Log("a.csv", trial.t_s, columns, np.arange(len(trial.t_s)) + 2)
 
 
+def _from(
+    row: int, columns: dict[str, FloatArray], trial: Trial
+) -> tuple[FloatArray, dict[str, FloatArray], IntArray]:
+    """Time, columns and line numbers of a log from a row on."""
+    rows = slice(row, None)
+    return trial.t_s[rows], {k: v[rows] for k, v in columns.items()}, np.arange(len(trial.t_s))[rows] + 2
+
+
 def _turned(columns: dict[str, FloatArray], turn: Rotation, conjugated: bool) -> dict[str, FloatArray]:
     """The same arm in a world whose axes are others."""
     out = dict(columns)
@@ -360,6 +368,9 @@ def test_an_arm_that_bends_to_negative_angles_is_the_same_arm() -> None:
     again = trial_of(recording, frame, "a", 0.0)
     np.testing.assert_allclose(again.angle_rad, trial.angle_rad[: len(again.angle_rad)], atol=2e-3)
     np.testing.assert_allclose(again.chord_m, trial.chord_m[: len(again.chord_m)], atol=2e-4)
+    # A log that begins where the arm is bent most grows the same way.
+    later = Log("a.csv", *_from(int(np.argmax(trial.angle_rad)), columns, trial))
+    assert frame_of([recording_of(later, "a")]).grows == -1.0
     # Beside poses that turn about some axis of their own it is the same arm too.
     poses = recording_of(_log(columns_of(trial), trial), "b")
     both = trial_of(recording, frame_of([poses, recording]), "a", 0.0)
@@ -421,6 +432,9 @@ def test_pressures_from_vacuum_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)
     assert "vacuum" not in _said(columns, trial)
+    # One that nobody vents and that stays below its command need not.
+    held = replace(trial, pressure_kpa=102.0 + 0.4 * trial.pressure_kpa)
+    assert "vacuum" not in _said(columns_of(held), held)
     assert "poor: a: its pressure is 10" in _said(columns | {"p1_kpa": columns["p1_kpa"] + 101.3}, trial)
 
 

@@ -54,7 +54,8 @@ _UNSEEN_S, _UNKNOWN_S = 0.3, 1.0
 _TURNED_OFF_RAD = math.radians(45.0)
 _LEAST_SHARE = 0.1
 """Of the greatest change of a chamber, below which the change of another is noise."""
-
+_GROWS_STEP_S, _GROWS_S = 0.1, (0.1, 1.0, 4.0)
+"""Of the drive's lags, one of which the angle follows most."""
 _Between = Callable[[FloatArray, FloatArray], FloatArray]
 """Distances (n,) between values (n, k)."""
 
@@ -296,8 +297,11 @@ def _in_units(recording: Recording) -> list[Finding]:
             "Pa, each column with factor: 0.001"
         )
     if recording.command is not None and recording.pressure is not None:
-        asked, least = (float(np.nanpercentile(one, 1.0)) for one in (recording.command, recording.pressure))
-        if _AIR_KPA[0] < least < _AIR_KPA[1] and least - asked > _AIR_KPA[0]:
+        (asked, greatest), (least, most) = (
+            np.nanpercentile(one, (1.0, 99.0)) for one in (recording.command, recording.pressure)
+        )
+        # A chamber that is never vented does not rise above its command.
+        if _AIR_KPA[0] < least < _AIR_KPA[1] and least - asked > _AIR_KPA[0] and most > greatest:
             text = (
                 f"{recording.name}: its pressure is {least:.4g} kPa at the least, where the command goes "
                 f"down to {asked:.3g} kPa, as one that counts from vacuum"
@@ -376,12 +380,13 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
 
     Raises `BadInputError` where the tip hardly turns.
     """
-    angles = [one.planar[:, 0] for one in recordings if one.planar is not None]
+    planar = [one for one in recordings if one.planar is not None]
+    angles = [one.planar[:, 0] for one in planar if one.planar is not None]
     sign, zero = 1.0, 0.0
     if angles:
         begin = _circular_mean(np.array([_first(one) for one in angles]))
         zero = begin if abs(begin) > _MOUNTED_RAD else 0.0
-        sign = _grows([_continuous(one, zero) for one in angles])
+        sign = _grows(planar, [_continuous(one, zero) for one in angles])
     if all(one.turned is None for one in recordings):
         return Frame(None, sign, zero)
     frames = [_frame(recordings, conjugated) for conjugated in (False, True)]
@@ -396,16 +401,17 @@ def _frame(recordings: Sequence[Recording], conjugated: bool) -> Frame:
     """The frame under one convention, with a negative `leans` where the tip turns against its chord."""
     from scipy.spatial.transform import Rotation
 
+    posed = [
+        (one, one.turned[int(conjugated)], one.chord[int(conjugated)])
+        for one in recordings
+        if one.turned is not None and one.chord is not None
+    ]
     parts, starts, vectors = [], [], []
-    for one in recordings:
-        if one.turned is None or one.chord is None:
-            continue
-        turned, chord = one.turned[int(conjugated)], one.chord[int(conjugated)]
+    for _, turned, chord in posed:
         seen = np.isfinite(turned).all(axis=1) & np.isfinite(chord).all(axis=1)
-        turned, chord = turned[seen], chord[seen]
-        parts.append((turned, chord))
-        rotations = Rotation.from_quat(turned)
-        starts.append(rotations[: max(len(turned) // 100, 1)].mean())
+        parts.append((turned[seen], chord[seen]))
+        rotations = Rotation.from_quat(turned[seen])
+        starts.append(rotations[: max(len(rotations) // 100, 1)].mean())
         away = (rotations * rotations.mean().inv()).as_rotvec()
         vectors.append(away - away.mean(axis=0))
     values, axes = np.linalg.eigh(np.cov(np.concatenate(vectors).T))
@@ -437,7 +443,7 @@ def _frame(recordings: Sequence[Recording], conjugated: bool) -> Frame:
     straight = first * math.cos(offset) + side * math.sin(offset)
     return Frame(
         # The angle grows with bending, whatever way that is.
-        _grows(angles) * axis,
+        _grows([one for one, *_ in posed], [_twist(turned, axis, mount) for _, turned, _ in posed]) * axis,
         mount=mount.tolist(),
         conjugated=conjugated,
         leans=float(leans),
@@ -476,10 +482,21 @@ def _first(angles_rad: FloatArray) -> float:
     return float(np.median(seen[: max(len(seen) // 100, 1)])) if len(seen) else 0.0
 
 
-def _grows(recordings_rad: Sequence[FloatArray]) -> float:
-    """The sign with which angles, an array (n,) of each recording from rest, grow with bending."""
-    ranges = [(*np.nanpercentile(one, (1.0, 99.0)), _first(one)) for one in recordings_rad if len(one)]
-    return -1.0 if sum(low + high - 2.0 * first for low, high, first in ranges) < 0.0 else 1.0
+def _grows(recordings: Sequence[Recording], angles_rad: Sequence[FloatArray]) -> float:
+    """The sign with which the angles (n,) of each recording grow with what drives the arm, or a lag of it."""
+    from scipy.signal import lfilter
+
+    pairs = []
+    for one, angles in zip(recordings, angles_rad, strict=True):
+        grid = np.arange(one.t_s[0], one.t_s[-1], _GROWS_STEP_S)
+        drive = one.command if one.pressure is None else one.pressure
+        if drive is not None and np.isfinite(drive).any() and np.isfinite(angles).any():
+            pairs.append(tuple(_between(grid, one.t_s, x - np.nanmean(x)) for x in (drive, angles)))
+    alike = [
+        sum(float(lfilter([1.0 - a], [1.0, -a], drive) @ angles) for drive, angles in pairs)
+        for a in (math.exp(-_GROWS_STEP_S / lag_s) for lag_s in _GROWS_S)
+    ]
+    return -1.0 if max(alike, key=abs) < 0.0 else 1.0
 
 
 def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
