@@ -230,6 +230,26 @@ def test_a_marker_that_comes_back_elsewhere_is_told() -> None:
     assert tracker.elsewhere == [9] and "at 0.90 s" in tracker.doubt(np.arange(10) / 10)
 
 
+@pytest.mark.parametrize("start_px", [None, (200.0, 100.0)])
+def test_a_marker_is_told_from_wood_of_its_hue(start_px: tuple[float, float] | None) -> None:
+    """Of varnished oak every pixel has the hue, and a saturation of 0.6 where the paint has 0.9."""
+    grain = np.random.default_rng(1).normal(1.0, 0.05, (240, 320, 1))
+    wood = np.clip(grain * [70.0, 120.0, 175.0], 0, 255).astype(np.uint8)
+    frame = on_grey((200.0, 100.0))
+    bare = frame[..., 2] == 60
+    frame[bare] = wood[bare]
+    cv2.circle(frame, (197, 97), 2, (235, 240, 250), -1, cv2.LINE_AA)
+    colour = parse_colour("orange") if start_px is None else colour_at(frame, (202.0, 102.0))
+    assert colour is not None
+    tracker = Tracker(colour, start_px)
+    assert start_px is not None or tracker.follow(wood) is None
+    one = tracker.follow(frame)
+    assert one is not None and one.centre_px == pytest.approx([200.0, 100.0], abs=0.1)
+    # The box, which a Pixy2 tells, is the disc's.
+    assert one.box_px == pytest.approx((191, 91, 209, 109), abs=1)
+    assert tracker.follow(wood) is None
+
+
 @pytest.mark.few(1, 7, 10, 13)
 @pytest.mark.parametrize("covered", [4, 10, 40])
 @pytest.mark.parametrize(

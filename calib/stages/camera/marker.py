@@ -40,6 +40,10 @@ _HUE_DEG = 16.0
 _LEAST_SATURATION = 0.30
 _SATURATION_SHARE = 0.55
 """Least saturation over that of the marker."""
+_FULL = 0.05
+"""Share of a picture from which on the background has the marker's colour, as wood has that of orange."""
+_PURER = (0.75, 0.6)
+"""Least saturations that may tell a marker from such a background: varnished oak has 0.6, pine 0.45."""
 _LEAST_VALUE = 0.12
 _LEAST_PIXELS = 12
 _COARSE_PX = 400
@@ -93,10 +97,14 @@ noise may add."""
 
 @dataclass(frozen=True)
 class Colour:
-    """Hue in degrees and saturation from 0 to 1; None where any saturated colour of the hue will do."""
+    """Hue in degrees and saturation from 0 to 1; None where any saturated colour of the hue will do.
+
+    `least` is the saturation below which no pixel has the colour.
+    """
 
     hue_deg: float
     saturation: float | None = None
+    least: float = _LEAST_SATURATION
 
 
 @dataclass(frozen=True)
@@ -160,9 +168,7 @@ def colour_at(bgr: AnyArray, pixel: tuple[float, float]) -> Colour | None:
 def coloured(bgr: AnyArray, colour: Colour) -> BoolArray:
     """Pixels (H, W) of a colour."""
     hsv = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)
-    least = _LEAST_SATURATION
-    if colour.saturation is not None:
-        least = max(least, _SATURATION_SHARE * colour.saturation)
+    least = max(colour.least, _SATURATION_SHARE * (colour.saturation or 0.0))
     low, high = colour.hue_deg - _HUE_DEG, colour.hue_deg + _HUE_DEG
     # OpenCV's hue goes from 0 to 179 in steps of two degrees.
     parts = [(low, high)]
@@ -325,11 +331,13 @@ def _box(bgr: AnyArray, ellipse: _Ellipse, colour: Colour) -> tuple[int, int, in
     reach = float(ellipse.axes_px.max()) + 2.0
     left, top = (max(int(value), 0) for value in np.floor(ellipse.centre_px - reach))
     right, bottom = (int(value) for value in np.ceil(ellipse.centre_px + reach) + 1)
-    mask = coloured(np.ascontiguousarray(bgr[top:bottom, left:right]), colour)
+    about = np.ascontiguousarray(bgr[top:bottom, left:right])
+    mask = coloured(about, colour)
     v, u = np.ogrid[: mask.shape[0], : mask.shape[1]]
     near = np.hypot(u + left - ellipse.centre_px[0], v + top - ellipse.centre_px[1])
     inside = near < 0.8 * float(ellipse.axes_px.min())
-    if not mask[inside].mean() > _LEAST_COLOURED:
+    # A glint is paler, whatever the background asks for.
+    if not coloured(about, replace(colour, least=_LEAST_SATURATION))[inside].mean() > _LEAST_COLOURED:
         return None
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]), top + int(rows[-1])
@@ -541,6 +549,8 @@ class Tracker:
                 path.since += 1
         self._others = [path for path in self._others if path.since < _FORGOTTEN_FRAMES]
         found = discs(bgr, self.colour)
+        if self._marker is None and not self._begins(found) and coloured(bgr, self.colour).mean() > _FULL:
+            found = self._purer(bgr) or found
         self.doubled += len(found) > 1
         if self.frames == 1:
             self.first = found
@@ -570,6 +580,19 @@ class Tracker:
         """Count from the next frame on."""
         self.frames = self.doubled = 0
         self.elsewhere, self._before = [], None
+
+    def _begins(self, found: list[Disc]) -> bool:
+        """Whether one of the discs may be the marker."""
+        return bool(found) if self.start_px is None else self._first(found) is not None
+
+    def _purer(self, bgr: AnyArray) -> list[Disc]:
+        """Discs of the purest colour that the marker may have, kept from then on; empty without any."""
+        for least in _PURER:
+            purer = replace(self.colour, least=least)
+            if self._begins(found := discs(bgr, purer)):
+                self.colour = purer
+                return found
+        return []
 
     def _first(self, found: list[Disc]) -> Disc | None:
         if not found:
