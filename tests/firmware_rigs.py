@@ -32,7 +32,7 @@ def _camera(**more: Any) -> dict[str, Any]:
     return section | more
 
 
-def _plane(camera: dict[str, Any]) -> dict[str, Any]:
+def _plane(camera: dict[str, Any], tilt_rad: float | None = None) -> dict[str, Any]:
     K = np.array(
         [
             [camera["fx_px"], camera["skew_px"], camera["cx_px"]],
@@ -41,6 +41,9 @@ def _plane(camera: dict[str, Any]) -> dict[str, Any]:
         ]
     )
     R, t = np.array(PLANE.R_CW), np.array(PLANE.t_m)
+    if tilt_rad is not None:
+        c, s = np.cos(tilt_rad), np.sin(tilt_rad)
+        R, t = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]), np.array([0.0, -0.065, 0.28])
     A = K @ np.column_stack([R[:, 0], R[:, 1], t])
     return {
         "R_CW": R.tolist(),
@@ -148,8 +151,8 @@ def rig(kind: str = "nominal") -> Rig:
     """A rig with camera and plane; "full" with every section, "levelling" the same with that angle filter.
 
     "fisheye" has a lens of 110 degrees, and an elliptic low-pass. "plain" has no lens, and a low-pass of
-    order 8. "fused" has what that estimator needs,
-    "twin" the same with the sensors of the nominal simulated rig.
+    order 8. "tilted" sees the plane from the side, a metre away at the picture's edge. "fused" has what that
+    estimator needs, "twin" the same with the sensors of the nominal simulated rig.
     """
     camera = _camera()
     sections: dict[str, Any] = {"camera": camera, "plane": _plane(camera)}
@@ -157,6 +160,8 @@ def rig(kind: str = "nominal") -> Rig:
         lens = {"k1": 0.03, "k2": -0.01, "k3": 0.004, "k4": -0.001}
         camera = _camera(model="fisheye4", distortion=lens, fx_px=164.0, fy_px=164.5)
         sections = {"camera": camera, "plane": _plane(camera), "lowpass": _lowpass("elliptic")}
+    if kind == "tilted":
+        sections["plane"] = _plane(camera, np.radians(60.0))
     if kind == "plain":
         camera, control = _camera(model="pinhole", distortion={}), _controller()
         control["orientation"]["sign"] = -1

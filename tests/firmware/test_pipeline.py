@@ -176,6 +176,7 @@ def test_the_horizon_is_a_lost_marker(tmp_path: Path) -> None:
     [
         ("levelling", 0, "CALIB_BELLOWS_RADIUS_M"),
         ("fisheye", 0, "CALIB_BELLOWS_RADIUS_M"),
+        ("tilted", 0, "CALIB_BELLOWS_RADIUS_M"),
         ("full", 1, "CALIB_FUSED_MOVING_RATE"),
     ],
 )

@@ -2,7 +2,8 @@
 
 The reference starts from nothing, as the board does, so a log has to begin with sequence number 0
 (opening the port restarts the usual boards). Where frames are missing the board went on from what is not
-known here; the comparison ends there. Tolerances are those of the self-test.
+known here; the comparison ends there. Tolerances are those of the self-test, larger from the first marker on
+that was far away.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
 from calib.core.verdict import Finding, Verdict
 from calib.io.serial import BOARD_COLUMNS, FAULTS, GUARD_RUN, Frame, Outputs, frame_from_row
-from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, reference_of
+from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, MARKER_HELD, reference_of
 from calib.stages.firmware.header import Header
-from calib.stages.firmware.vectors import TOLERANCE
+from calib.stages.firmware.vectors import TOLERANCE, tolerance
 
 _CLAMP_BITS = CLAMPED[0] | CLAMPED[1]
 _UNDECIDED_M = 1e-6
@@ -33,7 +34,7 @@ class Check:
     Attributes
     ----------
     ticks : that were compared. missing_after : ticks before the first lost frame, None without one.
-    worst : largest difference by quantity of `vectors.TOLERANCE`.
+    worst : largest difference by quantity of `vectors.TOLERANCE`. allowed : tolerances at the end.
     flags_differ : ticks whose flags were others.
     first_bad : the first tick beyond a tolerance, with the quantity; None where there is none.
     faults : of the guard, with the first tick of each.
@@ -42,6 +43,7 @@ class Check:
     ticks: int
     missing_after: int | None
     worst: dict[str, float]
+    allowed: dict[str, float]
     flags_differ: int
     first_bad: tuple[int, str] | None
     faults: dict[int, int]
@@ -128,7 +130,7 @@ def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
     if by_fused and not header.values["CALIB_HAS_FUSED"]:
         raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
     reference = reference_of(header.values, fused=by_fused, mean_rate=by_mean)
-    worst = dict.fromkeys(TOLERANCE, 0.0)
+    worst, allowed, rounding_m = dict.fromkeys(TOLERANCE, 0.0), TOLERANCE, 0.0
     differ, bad, ticks, lost = 0, None, 0, None
     faults: dict[int, int] = {}
     for tick, frame in enumerate(frames):
@@ -137,11 +139,15 @@ def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
             break
         wanted = reference.step(frame.given, frame.out.flags)
         found = _differences(frame.out, wanted)
-        over = [name for name, value in found.items() if value > TOLERANCE[name]]
+        if not wanted.flags & MARKER_HELD:
+            # Low-pass and controller remember it.
+            rounding_m = max(rounding_m, reference.rounding_m(frame.given.u_px, frame.given.v_px))
+            allowed = tolerance(rounding_m)
+        over = [name for name, value in found.items() if value > allowed[name]]
         if (frame.out.flags ^ wanted.flags) & ~_CLAMP_BITS:
             differ += 1
             over.append("flags")
-        if wanted.undecided_pwm > TOLERANCE["pwm"]:
+        if wanted.undecided_pwm > allowed["pwm"]:
             over.append("the decision to clamp")
         if wanted.undecided_m > _UNDECIDED_M:
             over.append("the decision on rest, motion or a marker to leave out")
@@ -153,4 +159,4 @@ def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
             bad = (tick, over[0])
         worst = {name: max(worst[name], value) for name, value in found.items()}
         ticks += 1
-    return Check(ticks, lost, worst, differ, bad, faults)
+    return Check(ticks, lost, worst, allowed, differ, bad, faults)

@@ -186,13 +186,23 @@ class Reference:
             x, y = a * P, b * P
         return x, y
 
-    def on_plane(self, u: float, v: float) -> tuple[float, float, float]:
-        """X W, Y W and W [1/m] of a pixel's place in the plane (2.11)."""
+    def _on_plane(self, u: float, v: float) -> list[tuple[float, float, float]]:
+        """The terms of X W, Y W and W [1/m] of a pixel's place in the plane (2.11)."""
         stem, c = "PLANE_RAW", self.c
         if self.undistort:
             stem, (u, v) = "PLANE_NORMALISED", self.undistorted(u, v)
-        X, Y, W = (c[f"{stem}_{i}1"] * u + c[f"{stem}_{i}2"] * v + c[f"{stem}_{i}3"] for i in (1, 2, 3))
+        return [(c[f"{stem}_{i}1"] * u, c[f"{stem}_{i}2"] * v, c[f"{stem}_{i}3"]) for i in (1, 2, 3)]
+
+    def on_plane(self, u: float, v: float) -> tuple[float, float, float]:
+        """X W, Y W and W [1/m] of a pixel's place in the plane."""
+        X, Y, W = (sum(terms) for terms in self._on_plane(u, v))
         return X, Y, W
+
+    def rounding_m(self, u: float, v: float) -> float:
+        """What half a bit in each term moves that place by [m]: more the farther away it is."""
+        (X, Y, W), sizes = self.on_plane(u, v), [sum(map(abs, t)) for t in self._on_plane(u, v)]
+        away = max(sizes[0] + abs(X / W) * sizes[2], sizes[1] + abs(Y / W) * sizes[2])
+        return away / abs(W) * 2.0**-24
 
     def _marker(self, given: Inputs) -> tuple[int, bool]:
         c, m, flags = self.c, self.memory, MARKER_HELD

@@ -68,7 +68,6 @@ def _write(files: Files, outcome: Header | Check) -> list[Path]:
 
 def _document(outcome: Header | Check) -> dict[str, Any]:
     from calib.stages.firmware.header import Header
-    from calib.stages.firmware.vectors import TOLERANCE
 
     gate = outcome.verdict.reasons or "passed"
     if isinstance(outcome, Header):
@@ -78,7 +77,7 @@ def _document(outcome: Header | Check) -> dict[str, Any]:
             "ticks": outcome.ticks,
             "lost_after": outcome.missing_after,
             "worst": outcome.worst,
-            "tolerance": TOLERANCE,
+            "tolerance": outcome.allowed,
             "flags_differ": outcome.flags_differ,
             "gate": gate,
         }
@@ -87,11 +86,12 @@ def _document(outcome: Header | Check) -> dict[str, Any]:
 
 def _words(outcome: Header | Check) -> list[Block]:
     from calib.stages.firmware.header import Header
-    from calib.stages.firmware.vectors import TOLERANCE
 
     if isinstance(outcome, Header):
         return [Line(f"{len(outcome.literals)} constants"), *of_verdict(outcome.verdict)]
-    rows = tuple((name, f"{worst:.2g}", f"{TOLERANCE[name]:g}") for name, worst in outcome.worst.items())
+    rows = tuple(
+        (name, f"{worst:.2g}", f"{outcome.allowed[name]:.2g}") for name, worst in outcome.worst.items()
+    )
     head = ("", "differs at most", "allowed")
     return [Line(f"{outcome.ticks} ticks compared"), Table(head, rows), *of_verdict(outcome.verdict)]
 
