@@ -10,11 +10,11 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.io.columns import COMMANDED, POSITION, PRESSURES, QUATERNION
 from calib.stages.arm.identify import FULL
-from calib.stages.arm.model import PARAMETERS, STEP_S, Scale, Trial, drive_run, segment_run
+from calib.stages.arm.model import COMPLIANCE, PARAMETERS, STEP_S, Scale, Trial, drive_run, segment_run
 
 SCALE = Scale(275.0, 0.6, 0.178, 0.13, 275.0)
 TRUE = FULL.without("creep").values(
-    np.array([0.3 if one.name != "compliance_rad_per_Nm" else 0.0 for one in PARAMETERS]), SCALE
+    np.array([0.0 if one.name in COMPLIANCE else 0.3 for one in PARAMETERS]), SCALE
 )
 
 

@@ -29,12 +29,14 @@ from calib.stages.arm.identify import (
     mean_of,
 )
 from calib.stages.arm.model import (
+    COMPLIANCE,
     NO_JUMP_KPA,
     PARAMETERS,
     STEP_S,
     Assembly,
     Trial,
     drive_run,
+    load_bends,
     segment_run,
     values_on,
 )
@@ -115,12 +117,21 @@ def test_a_load_bends_an_upright_arm_further() -> None:
     assert loaded.angle_rad[1000:].mean() > plain.angle_rad[1000:].mean() + math.radians(0.5)
 
 
-def test_a_soft_arms_compliance_is_found_from_one_loaded_trial() -> None:
-    """Fifteen times the usual one: a narrow prior held it below half."""
-    soft = {**TRUE, "compliance_rad_per_Nm": 3.0}
+@pytest.mark.parametrize(
+    ("upright", "across", "finer"), [(3.0, 0.0, 1.0), (-3.0, 0.0, 10.0), (0.0, 1.0, 1.0)]
+)
+def test_a_soft_arms_compliance_is_found_from_one_loaded_trial(
+    upright: float, across: float, finer: float
+) -> None:
+    """Fifteen times the usual one, that of an arm that hangs, and of one that lies."""
+    soft = {**TRUE, "compliance_rad_per_Nm": upright, "compliance_across_rad_per_Nm": across}
     trials = [simulated(f"a_{k}", k, load_kg=load, values=soft) for k, load in enumerate((0.0, 0.0, 0.1))]
-    made = fit(trials, FULL, SCALE)
-    assert made.values["compliance_rad_per_Nm"] == pytest.approx(3.0, rel=0.15)
+    made = fit(trials, FULL, replace(SCALE, finer=finer))
+    for angle_rad in (0.3, 0.5):
+        found, true = (
+            load_bends(angle_rad, *(of[name] for name in COMPLIANCE)) for of in (made.values, soft)
+        )
+        assert found == pytest.approx(true, rel=0.15)
 
 
 def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -> None:

@@ -24,16 +24,17 @@ at most the hysteresis' range; c creeps after the angle; s is by how much the ch
 as of an arm that was vented, and s' is that of the chord, which recovers in a time of its own:
 
     dp_f/dt = (p - p_f) / t_f
-    tau dphi/dt = phi_0 + (a p_f + C M(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
+    tau dphi/dt = phi_0 + (a p_f + m g l W(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
     dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s,  s' as s
 
-M = m g l sin(.55 phi) is the moment of a load at the tip of an upright arm of
-length l, whose chord leans by about .55 of the angle. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s'.
+W = C sin(.55 phi) + D cos(.55 phi) is by how much the moment m g l of a load at the tip of an arm of length l
+bends it, whose chord leans by about .55 of the angle: C > 0 of one that stands, C < 0 of one that hangs, D of
+one that lies. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s'.
 
 What differs from day to day is a factor of a, and of D or G: an arm is refitted, its rubber rests, and so do
 the valve's springs.
 
-Area, stiffness and lever arm are one number, a, without a known load; with one, C separates the stiffness.
+Area, stiffness and lever arm are one number, a, without a known load; with one, C and D tell the stiffness.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ class Parameter:
     Attributes
     ----------
     centre, spread : prior; of the logarithm where `positive`, in units of `powers` otherwise.
+    either_way : a size from which on the prior is that of a logarithm, whatever the sign.
     powers : of pressure, angle, chord and command of the scale that make its unit.
     identified_by : what a log must hold to tell it.
     """
@@ -94,11 +96,14 @@ class Parameter:
     positive: bool = False
     powers: tuple[int, int, int, int] = (0, 0, 0, 0)
     identified_by: str = ""
+    either_way: float = 0.0
 
     def value(self, z: float, scale: Scale) -> float:
         """The number at z standard deviations of the prior from its centre."""
         if self.positive:
             return self._size(scale) * self.centre * math.exp(self.spread * z)
+        if self.either_way:
+            return self.either_way * math.sinh(math.asinh(self.centre / self.either_way) + self.spread * z)
         offset = scale.rest_rad if self.name == "rest_rad" else 0.0
         return offset + self._size(scale) * (self.centre + self.spread * z)
 
@@ -212,8 +217,20 @@ PARTS = (
     ),
     Part(
         "load",
-        (Parameter("compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.7, True, identified_by="a known load"),),
-        {"compliance_rad_per_Nm": 0.0},
+        (
+            Parameter(
+                "compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.7, identified_by="a known load", either_way=0.1
+            ),
+            Parameter(
+                "compliance_across_rad_per_Nm",
+                "rad/(N m)",
+                0.0,
+                0.7,
+                identified_by="a known load",
+                either_way=0.1,
+            ),
+        ),
+        {"compliance_rad_per_Nm": 0.0, "compliance_across_rad_per_Nm": 0.0},
     ),
     Part(
         "chord",
@@ -236,6 +253,7 @@ DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PART
 """Parameters of the parts that make the pressure."""
 CHORD = tuple(one.name for part in PARTS if part.name == "chord" for one in part.parameters)
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
+COMPLIANCE = tuple(one.name for part in PARTS if part.name == "load" for one in part.parameters)
 DAILY = {"pilot_drains": 0.1, "kpa_per_command": 0.1, "bends_rad_per_kpa": 0.15}
 """Parameters that differ from day to day, and standard deviations of the logarithms of a day's factors."""
 Days = Mapping[str, Mapping[str, float]]
@@ -342,9 +360,16 @@ def _lag(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
 
 
 @kernel()
+def load_bends(angle_rad: float, compliance: float, across: float) -> float:
+    """By how much a moment of 1 N m of a load at the tip, across the straight arm, bends it [rad]."""
+    lean = _LEANS * angle_rad
+    return compliance * math.sin(lean) + across * math.cos(lean)
+
+
+@kernel()
 def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, moment: float) -> FloatArray:
     rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
-    compliance, c0, c1, c2, lengthens_s, longer = q[12:]
+    compliance, across, c0, c1, c2, lengthens_s, longer = q[12:]
     out = np.empty((len(pressure), 2))
     short = lacks = c0 + c1 * angle + c2 * angle * angle - chord
     elastic, crept = 0.0, 0.0
@@ -354,7 +379,8 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         out[k, 0] = angle
         out[k, 1] = c0 + c1 * angle + c2 * angle * angle - lacks
         inside += fills * (pressure[k] - inside)
-        bends = linear * inside + compliance * moment * math.sin(_LEANS * angle) - stop * elastic / reach
+        weighs = moment * load_bends(angle, compliance, across)
+        bends = linear * inside + weighs - stop * elastic / reach
         aim = rest + bends / max(1.0 + stiffens * inside, 0.1)
         change = follows * (aim + creep * crept + vented * short - angle)
         angle += change

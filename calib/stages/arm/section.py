@@ -7,10 +7,19 @@ from typing import Any, Literal
 from pydantic import model_validator
 
 from calib.core.result import NotNegative, Number, Positive, Result, Row3, Section, Sigma, quantity
-from calib.stages.arm.model import DAILY, DRIVES, NO_JUMP_KPA, PARAMETERS, PARTS, Assembly, values_on
+from calib.stages.arm.model import (
+    COMPLIANCE,
+    DAILY,
+    DRIVES,
+    NO_JUMP_KPA,
+    PARAMETERS,
+    PARTS,
+    Assembly,
+    values_on,
+)
 
 _PLAIN_VALVE = {"input_s": 1e-4, "pilot_jump_kpa": NO_JUMP_KPA}
-"""Parameters of a valve that files of earlier versions lack."""
+"""Parameters of a valve that files of earlier versions lack; there loads bend upright arms."""
 _AS_SETTLING = {"lengthens_s": "settling_s", "lengthens_per_kpa": "settling_per_kpa"}
 """Parameters that files of earlier versions lack: there the chord recovered as the angle settled."""
 
@@ -75,8 +84,10 @@ class Arm(Result):
             for day, one in section.get("days", {}).items()
         }
         out, parameters = section | {"days": days}, section.get("parameters")
-        if isinstance(parameters, dict) and "leak_per_s" in parameters:
-            out["parameters"] = _PLAIN_VALVE | parameters
+        if isinstance(parameters, dict):
+            earlier = _PLAIN_VALVE if "leak_per_s" in parameters else {}
+            earlier |= dict.fromkeys(COMPLIANCE[1:], 0.0) if COMPLIANCE[0] in parameters else {}
+            out["parameters"] = earlier | parameters
         return out
 
     @model_validator(mode="after")

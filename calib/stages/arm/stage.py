@@ -157,7 +157,7 @@ def _solve(
 def judge(found: Identification) -> Iterator[Finding]:
     """What the held trials, the baselines and the posterior say of an identification."""
     from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
-    from calib.stages.arm.model import DAILY
+    from calib.stages.arm.model import COMPLIANCE, DAILY, load_bends
 
     if not any(len(one.angle_rad) for one in found.trials):
         yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
@@ -200,10 +200,11 @@ def judge(found: Identification) -> Iterator[Finding]:
             "record trials on another day, too, and state it with --day where names do not tell",
         )
     values = found.fit.values
-    if values.get("compliance_rad_per_Nm", 0.0) < 0.0:
+    middle = values["rest_rad"] + 0.5 * size
+    if load_bends(middle, *(values[name] for name in COMPLIANCE)) < 0.0:
         yield Finding(
             "remark",
-            "a load straightens the arm, as it does one that hangs: its compliance is below zero",
+            "a load straightens the arm, as it does one that hangs or bends upwards",
             "where the arm stands upright look whether --load names the trials with the mass at the tip",
         )
     for trial in found.trials:
