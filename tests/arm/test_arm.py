@@ -339,6 +339,17 @@ def test_a_signal_that_freezes_while_others_move_is_told(column: str, least_s: f
     assert words in _said(columns, trial)
 
 
+@pytest.mark.parametrize(("falls_s", "frozen"), [(10.0, False), (25.0, True)])
+def test_an_arm_that_settles_slowly_under_a_held_command_is_sound(falls_s: float, frozen: bool) -> None:
+    trial = simulated("a", 1)
+    t, noise = trial.t_s, trial.pressure_kpa
+    moves = np.exp(-np.maximum(t - falls_s, 0.0) / 10.0) + 1e-6 * noise
+    settles = replace(
+        trial, command=np.where(t < 10.0, 200.0, 7.0), pressure_kpa=200.0 * moves, angle_rad=0.5 * moves
+    )
+    assert ("command stands still" in _said(columns_of(settles), settles)) == frozen
+
+
 def test_a_command_that_nobody_knows_and_a_place_that_jumps_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)

@@ -48,7 +48,7 @@ _JUMP_SHARE = 0.03
 _STILL, _MOVES = 1e-9, 0.2
 _FROZEN_S = {"pressure": 1.0, "pose": 1.0, "command": 10.0}
 """A signal that keeps its value to the digit for so long, while what it follows goes through this share of
-its range, is frozen; a command may be held, while the pressure settles for a part of that."""
+its range, is frozen; a command may be held, while what it drives settles."""
 _UNSEEN_S, _UNKNOWN_S = 0.3, 1.0
 """Gaps over which poses are not counted, and over which nobody knows the command or the pressure."""
 _TURNED_OFF_RAD = math.radians(45.0)
@@ -238,7 +238,8 @@ def _stuck(recording: Recording) -> Iterator[Finding]:
                 continue
             # What moved before the signal stood still may still arrive.
             rows = slice(int(np.searchsorted(t, t[first] + 0.5 * least_s)), last + 1)
-            moved = [other for other in others if _range(there[other][rows]) > _MOVES * _range(there[other])]
+            moves = _unsettled if name == "command" else _range
+            moved = [other for other in others if moves(there[other][rows]) > _MOVES * _range(there[other])]
             if moved:
                 yield Finding(
                     "poor",
@@ -247,6 +248,18 @@ def _stuck(recording: Recording) -> Iterator[Finding]:
                     "leave that log out, or cut it before it freezes",
                 )
                 break
+
+
+def _unsettled(values: FloatArray) -> float:
+    """By how much values (n,) or columns (n, k) move that do not settle: go back, or move most later on."""
+    columns = values.reshape(len(values), -1)
+    seen = columns[np.isfinite(columns).all(axis=1)]
+    if not len(seen):
+        return 0.0
+    falls, rises = np.maximum.accumulate(seen) - seen, seen - np.minimum.accumulate(seen)
+    back = float(np.minimum(falls.max(axis=0), rises.max(axis=0)).max())
+    early, late = (_range(half) for half in np.array_split(seen, 2))
+    return max(back, late if late > early else 0.0)
 
 
 def _unknown(recording: Recording) -> Iterator[Finding]:
