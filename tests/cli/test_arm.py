@@ -24,10 +24,14 @@ def test_an_arm_is_identified_and_predicted(calib: Run, tmp_path: Path) -> None:
     assert set(yaml.safe_load(text)["actuator"]["days"]) == {"a", "b"}
     assert str(tmp_path) not in text
     further = written(tmp_path, simulated("c_1", 9)).name
-    ended = calib("validate", further, cwd=tmp_path)
+    alike = written(tmp_path, simulated("a_7", 7, "a")).name
+    ended = calib("validate", further, alike, cwd=tmp_path)
     assert ended.code == 0, ended.err
     assert "day c is not in the rig" in ended.err and "may well be off by 15 %" in ended.err
-    assert float(ended.out.splitlines()[1].split()[1]) < 3.0
+    head, first, other, *reasons = ended.out.splitlines()
+    assert float(first.split()[1]) < 3.0
+    assert head.endswith("inside, %") and int(first.split()[-1]) < 85 < int(other.split()[-1])
+    assert len(reasons) == 1 and "c_1: " in reasons[0] and "another arm, load or day" in reasons[0]
 
 
 def test_what_logs_without_commands_do_not_tell_is_named(calib: Run, tmp_path: Path) -> None:

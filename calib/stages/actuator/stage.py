@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from calib.stages.arm.model import Trial
 
     Sections = tuple[Actuator, PumpSection | None]
+
+_MET = 0.85
+"""Of a trial's angles, below which it is unlike those whose errors gave the interval of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -433,11 +437,14 @@ class Validated:
 
     Attributes
     ----------
-    compared : logs of the actuator. held : free-run errors of an arm by log.
+    compared : logs of the actuator. held : free-run errors of an arm by log. inside : share of a log's angles
+        that are met to the interval [rad] of the arm in the rig.
     """
 
     compared: tuple[Comparison, ...] = ()
     held: Mapping[str, Errors] | None = None
+    inside: Mapping[str, float] = field(default_factory=dict)
+    interval_rad: float = math.nan
     verdict: Verdict = Verdict()
 
 
@@ -474,18 +481,24 @@ def _solve_validate(
     from calib.stages.actuator.validate import compare, models_of
 
     if trials:
-        from calib.stages.arm.identify import errors_by
+        from calib.stages.arm.identify import errors_by, within
 
         assert rig.arm is not None
-        held = {one.name: errors_by(rig.arm.values_on(one.day), one) for one in trials}
-        return Validated(held=held)
+        values = {one.name: rig.arm.values_on(one.day) for one in trials}
+        held = {one.name: errors_by(values[one.name], one) for one in trials}
+        half_rad = rig.arm.interval_rad or math.nan
+        met = {one.name: within(values[one.name], one, half_rad) for one in trials}
+        inside = {name: float(of.mean()) for name, of in met.items() if len(of) and math.isfinite(half_rad)}
+        return Validated(held=held, inside=inside, interval_rad=half_rad)
     models = models_of(rig)
     return Validated(tuple(compare(track, models, start) for track, start in tracks))
 
 
 def _validate_document(outcome: Validated) -> dict[str, Any]:
     if outcome.held is not None:
-        return {"validate": {"arm": {name: dict(one) for name, one in outcome.held.items()}}}
+        shares = outcome.inside
+        arm = {name: {**one, "inside": shares.get(name)} for name, one in outcome.held.items()}
+        return {"validate": {"arm": arm}}
     return {"validate": {"logs": [_log_json(one) for one in outcome.compared]}}
 
 
@@ -526,11 +539,34 @@ def _validate_words(outcome: Validated) -> list[Block]:
 
         scales = {name: of.scale for name, of in QUANTITIES.items()} | {"pressure_kpa": 1.0}
         rows = [
-            (name, *(_cell(scale * errors[of], ".2f") for of, scale in scales.items()))
+            (
+                name,
+                *(_cell(scale * errors[of], ".2f") for of, scale in scales.items()),
+                _cell(100.0 * outcome.inside.get(name, math.nan), ".0f"),
+            )
             for name, errors in outcome.held.items()
         ]
-        head = ("free run, RMS", "angle, °", "chord, mm", "angle by pressure, °", "pressure, kPa")
-        return [Table(head, tuple(rows))]
+        head = (
+            "free run, RMS",
+            "angle, °",
+            "chord, mm",
+            "angle by pressure, °",
+            "pressure, kPa",
+            "inside, %",
+        )
+        half = f"{math.degrees(outcome.interval_rad):.1f} deg"
+        return [
+            Table(head, tuple(rows)),
+            *(
+                Line(
+                    f"{name}: {100.0 * share:.0f} % of its angles are met to {half}, as 95 % are of a trial "
+                    "like the identified ones: another arm, load or day, or the arm has changed",
+                    "reason",
+                )
+                for name, share in outcome.inside.items()
+                if share < _MET
+            ),
+        ]
     blocks: list[Block] = []
     for one in outcome.compared:
         hoses = "pumps connected" if one.hoses else "hoses off"

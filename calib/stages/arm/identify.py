@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from calib.core.arrays import FloatArray, IntArray, blocks, rms
+from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, rms
 from calib.stages.arm.model import (
     CHORD,
     DAILY,
@@ -422,17 +422,20 @@ def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Sc
     return scale, best
 
 
+def within(values: Mapping[str, float], trial: Trial, half_rad: float) -> BoolArray:
+    """Which samples (n,) of a trial's angle the free run from its command meets to half an interval."""
+    return np.asarray(np.abs(by_command(trial, values).get("angle_rad", _NONE)) <= half_rad)
+
+
 def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Errors]) -> float:
-    inside = total = 0
+    inside = [_NONE > 0.0]
     for one in trials:
         wide = half_width([errors[other.name]["angle_rad"] for other in trials if other is not one])
-        if not (len(one.command) and len(one.angle_rad)) or math.isnan(wide):
-            continue
-        made = held[one.name]
-        off = by_command(one, values_on(one.day, made.values, made.days))["angle_rad"]
-        inside += int(np.sum(np.abs(off) <= wide))
-        total += len(off)
-    return inside / total if total else math.nan
+        if math.isfinite(wide):
+            made = held[one.name]
+            inside.append(within(values_on(one.day, made.values, made.days), one, wide))
+    every = np.concatenate(inside)
+    return float(every.mean()) if len(every) else math.nan
 
 
 # ----------------------------------------------------------------------
