@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
-from calib.core.rig import Rig
+from calib.core.rig import Provenance, Rig
 from calib.stages.actuator.parameters import Stiffness
 from calib.stages.actuator.pump import ElongationForce
 from calib.stages.align.section import LogCheck
@@ -370,11 +370,53 @@ def _with(section: str, **changes: object) -> Rig:
     return whole.with_sections({section: getattr(whole, section).model_copy(update=changes)})
 
 
+_IMU = {
+    "rate_hz": 100.0,
+    "gyro_bias_radps": [0.0, 0.0, 0.021],
+    **{
+        f"{kind}_{what}": [0.1, 0.1, 0.1]
+        for kind, whats in (
+            (
+                "gyro",
+                ("noise_radps_per_sqrt_Hz", "instability_radps", "walk_radps2_per_sqrt_Hz", "step_radps"),
+            ),
+            (
+                "accel",
+                ("noise_mps2_per_sqrt_Hz", "instability_mps2", "walk_mps3_per_sqrt_Hz", "step_mps2"),
+            ),
+        )
+        for what in whats
+    },
+    "accel_mean_mps2": [9.8, 0.0, 0.0],
+    "verdict": "ok",
+}
+
+
 def test_gains_for_an_imu_that_nobody_has_measured_are_poor() -> None:
     whole = rig("full")
     assert "neither imu nor align" not in str(header_of(whole, "rig.yaml").verdict.reasons)
     bare = whole.only([name for name in whole.sections if name not in ("imu", "align", "estimator")])
     assert "neither imu nor align" in str(header_of(bare, "rig.yaml").verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("accel_mps2", "told"), [([9.8, 0.5], False), ([0.1, 9.8], True), ([-9.8, 0.1], True)]
+)
+def test_an_imu_that_is_turned_and_not_aligned_is_poor(accel_mps2: list[float], told: bool) -> None:
+    whole = rig("full")
+    imu = Rig.of({"imu": {**_IMU, "accel_mean_mps2": [*accel_mps2, 0.0]}}, "rig.yaml").imu
+    bare = whole.only([name for name in whole.sections if name not in ("align", "estimator")])
+    reasons = header_of(bare.with_sections({"imu": imu}), "rig.yaml").verdict.reasons
+    assert ("which the board takes for bending" in str(reasons)) is told
+
+
+def test_a_section_that_was_taken_away_is_missed() -> None:
+    """Its defaults are of another rig than the gains."""
+    inputs = {"controller": {"actuator": "", "align": "1" * 64}}
+    whole = rig("full").with_sections({"provenance": Provenance(inputs=inputs)})
+    assert "not there" not in str(header_of(whole, "rig.yaml").verdict.reasons)
+    reasons = header_of(whole.with_sections({"align": None}), "rig.yaml").verdict.reasons
+    assert "align, with which controller was computed, is not there: the header has defaults" in reasons
 
 
 def test_a_camera_slower_than_the_tick_is_poor() -> None:
@@ -483,27 +525,7 @@ def test_the_state_variable_form_is_the_section() -> None:
 
 
 def test_the_bias_of_the_imu_at_rest_is_used_without_align() -> None:
-    imu = {
-        "rate_hz": 100.0,
-        "gyro_bias_radps": [0.0, 0.0, 0.021],
-        **{
-            f"{kind}_{what}": [0.1, 0.1, 0.1]
-            for kind, whats in (
-                (
-                    "gyro",
-                    ("noise_radps_per_sqrt_Hz", "instability_radps", "walk_radps2_per_sqrt_Hz", "step_radps"),
-                ),
-                (
-                    "accel",
-                    ("noise_mps2_per_sqrt_Hz", "instability_mps2", "walk_mps3_per_sqrt_Hz", "step_mps2"),
-                ),
-            )
-            for what in whats
-        },
-        "accel_mean_mps2": [9.8, 0.0, 0.0],
-        "verdict": "ok",
-    }
-    c = header_of(Rig.of({"imu": imu}, "rig.yaml"), "rig.yaml").values
+    c = header_of(Rig.of({"imu": _IMU}, "rig.yaml"), "rig.yaml").values
     assert c["CALIB_IMU_GYRO_BIAS_RADPS"] == pytest.approx(0.021)
     assert c["CALIB_MM_GYRO_BIAS_DT_RAD"] == pytest.approx(0.021 / 60.0)
     assert "imu.gyro_bias_radps" in header().text

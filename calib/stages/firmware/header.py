@@ -23,7 +23,7 @@ import numpy as np
 from calib.core import __version__
 from calib.core.errors import BadInputError
 from calib.core.result import identity
-from calib.core.rig import KINDS
+from calib.core.rig import KINDS, VERBS
 from calib.core.verdict import Finding, Verdict
 from calib.core.writing import Kind, begins, make_folder, write_atomically
 from calib.stages.camera.lens import fit_inverse
@@ -230,6 +230,33 @@ def _of_envelope(stated: Envelope, allowed: Mapping[str, Any], rest_m: float) ->
     return [Finding("remark", text)] if wide else []
 
 
+_DEFAULTED = ("align", "actuator", "pump")
+"""Sections for which the header has defaults."""
+_MOUNTED_RAD = 0.1
+"""Angle of an IMU at rest that the board may take for bending: 1.3 mm of the nominal bellows' lengths."""
+
+
+def _of_defaults(whole: Rig, taken: list[str]) -> list[Finding]:
+    """Findings on defaults of a rig that controls: in place of sections that are gone, and of the mount."""
+    found = []
+    for gone in _DEFAULTED:
+        with_it = [name for name in taken if whole.inputs.get(name, {}).get(gone)]
+        if getattr(whole, gone) is None and with_it:
+            text = f"{gone}, with which {with_it[0]} was computed, is not there: the header has defaults"
+            found.append(Finding("poor", text, f"run calib {VERBS[gone]} again"))
+    if whole.align is None and whole.imu is None:
+        text = "neither imu nor align: the board's angle comes from an IMU that nobody has measured"
+        found.append(Finding("poor", text, "run calib imu static and calib align"))
+    elif whole.align is None and whole.imu is not None:
+        signs = (whole.geometry and whole.geometry.imu_sign) or (1, 1, 1)
+        ax, ay = ((whole.imu.accel_mean_mps2[i] or 0.0) * signs[i] for i in range(2))
+        rest_rad = math.atan2(ay, ax)
+        if abs(rest_rad) > _MOUNTED_RAD:
+            text = f"no align: the IMU reads {rest_rad:.2f} rad at rest, which the board takes for bending"
+            found.append(Finding("poor", text, "run calib align"))
+    return found
+
+
 def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
     """Findings on the sections that the constants come from, and on how the lens is undone."""
     findings = []
@@ -254,9 +281,8 @@ def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
         findings.append(Finding("remark", text, f"run calib {verb}"))
     elif whole.controller is None:
         findings.append(Finding("remark", _UNTUNED, "run calib identify and calib control tune"))
-    elif whole.imu is None and whole.align is None:
-        text = "neither imu nor align: the board's angle comes from an IMU that nobody has measured"
-        findings.append(Finding("poor", text, "run calib imu static and calib align"))
+    else:
+        findings += _of_defaults(whole, [*taken, "actuator", "pump"])
     logs = [] if whole.align is None else whole.align.logs
     rates_hz = [one.camera_rate_hz for one in logs if one.camera_rate_hz]
     seen_hz = median(rates_hz) if rates_hz else whole.tick_hz
