@@ -19,6 +19,7 @@ from scipy.special import stdtrit
 import calib.stages.imu.intrinsics
 from calib.core.result import section_json
 from calib.core.rig import Rig
+from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.intrinsics import (
@@ -55,6 +56,10 @@ def test_a_known_sensor_is_recovered_within_its_deviations(counts: bool) -> None
     truth = np.concatenate([sensor.accel_bias, sensor.accel_scale, sensor.accel_angles])
     assert np.abs((accel.parameters - truth) / accel.sigma).max() < 4.0
     assert accel.sigma[3:6].max() < 2e-4 * sensor.accel_scale.max()
+    # Gravity that nobody stated is told, as it moves the scales by more than that.
+    for gravity_mps2, told in ((G, False), (GRAVITY_MPS2, True)):
+        remarks = judge_intrinsics(replace(result, gravity_mps2=gravity_mps2)).remarks
+        assert any("9.83" in remark for remark in remarks) == told
 
 
 def test_a_plane_is_seen_or_asked_for() -> None:
@@ -168,6 +173,15 @@ def test_poses_on_one_side_leave_bias_and_scale_apart_unknown() -> None:
     assert np.abs(fit.weakest[[2, 5]]).min() > 0.3
 
 
+def test_residuals_that_are_small_by_chance_make_nothing_certain() -> None:
+    """Thirteen poses leave four degrees of freedom: of forty sets one has a third of the usual residuals."""
+    rng, up, truth = np.random.default_rng(3), _ups(13), _truth(PLAIN)
+    fits = [fit_accelerometer(_rests(up, PLAIN, rng), G, True) for _ in range(40)]
+    off = np.array([(fit.parameters - truth) / fit.sigma for fit in fits])
+    assert np.abs(off).max() < 4.0
+    assert np.sqrt((off**2).mean()) == pytest.approx(1.0, abs=0.15)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("d", "beyond"), [(3, 0.0), (3, 0.004), (2, 0.0)])
 def test_reported_deviations_are_those_of_many_repetitions(d: int, beyond: float) -> None:
@@ -182,9 +196,12 @@ def test_reported_deviations_are_those_of_many_repetitions(d: int, beyond: float
         sigmas.append(fit.sigma)
     error, sigma = np.array(errors), np.array(sigmas)
     reported = np.sqrt((sigma**2).mean(axis=0))
-    assert error.std(axis=0) / reported == pytest.approx(np.ones(len(truth)), abs=0.15)
+    # The scale of the residuals, chi-square, counts where it is more than the noise asks for.
+    dof = len(up) - len(truth)
+    scale2 = 1.0 if beyond else np.maximum(rng.chisquare(dof, 100_000) / dof, 1.0).mean()
+    assert error.std(axis=0) / reported == pytest.approx(np.full(len(truth), scale2**-0.5), abs=0.15)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * (reported / np.sqrt(250)).max()
-    inside = np.abs(error) < stdtrit(len(up) - len(truth), 0.975) * sigma
+    inside = np.abs(error) < 1.96 * sigma
     assert inside.mean() == pytest.approx(0.95, abs=0.02)
 
 

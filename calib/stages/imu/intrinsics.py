@@ -15,6 +15,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged
+from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.levelling import turned
@@ -87,7 +88,8 @@ def turn_directions(
 # where tau is what the rests disagree by beyond their noise (a bias that moves, a table that gives way),
 # chosen so that the weighted residuals have the size that their degrees of freedom ask for. So neither a long
 # rest counts for more than it is worth, nor a short one for less. Standard deviations follow from the normal
-# equations times the measured scale of the residuals.
+# equations times the measured scale of the residuals, where that is above one: few residuals may be small by
+# chance, and the noise is known.
 #
 # What can be told is judged by the singular values of dr/dp, in units of g, by which the root of the number
 # of rests is divided. Poses all over the sphere make the smallest 0.26, on the circle 0.35. Misalignments
@@ -337,7 +339,7 @@ def fit_accelerometer(rests: Sequence[Rest], gravity_mps2: float, si: bool) -> A
         span = min(span, least)
     r, J = _residual_and_jacobian(p, x, g)
     dof = n - len(free)
-    scale2 = float(((r / deviation) ** 2).sum()) / dof if dof > 0 else 1.0
+    scale2 = max(float(((r / deviation) ** 2).sum()) / dof, 1.0) if dof > 0 else 1.0
     sigma, covariance = np.full(len(p), math.inf), np.zeros((len(p), len(p)))
     if span > 1e-6:
         units = _units(p, d, g)[free]
@@ -980,6 +982,8 @@ _SQUARE_RAD = 0.01
 _USELESS = 20.0
 _NEAR = 0.5
 _LARGEST_RMS_G = 0.01
+_GRAVITY_SHARE = 0.0027
+"""By which gravity is less at the equator and more at the poles than the standard one."""
 _OFF_SCALE = 0.15
 _OFF_ANGLE_RAD = math.radians(15.0)
 _ROUGH_TURNS_RAD, _WRONG_TURNS_RAD = 0.03, 0.2
@@ -1055,6 +1059,13 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Find
     size = np.concatenate([g * accel.scale, accel.scale, np.ones(k)])
     limits = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, k])
     yield from _loose("accelerometer", names, accel.sigma / size, limits, result.planar)
+    if g == GRAVITY_MPS2 and float((accel.sigma[d : 2 * d] / accel.scale).max()) < _GRAVITY_SHARE:
+        yield Finding(
+            "remark",
+            f"the scales hold where gravity is {g:g} m/s^2; on Earth it is 9.78 to 9.83, by "
+            f"{_GRAVITY_SHARE:.2%} less or more",
+            "state that of the place with --gravity where scales matter",
+        )
     if not accel.skewed:
         yield Finding(
             "remark",
