@@ -51,7 +51,10 @@ def test_a_poor_rig_is_written_and_marked(calib, rig, which: str) -> None:
     ended = calib("firmware", "--rig", rig, "-o", rig.parent, "--json")
     assert ended.code == 1
     weak = ["camera", "plane"] if which == "both" else [which]
-    assert json.loads(ended.out)["gate"] == [f"{name} is poor" for name in weak]
+    told = json.loads(ended.out)
+    assert told["gate"] == [f"{name} is poor" for name in weak]
+    assert UNTUNED in told["remarks"]
+    assert "run calib identify and calib control tune" in told["advice"]
     text = (rig.parent / "calib_constants.h").read_text()
     for name in ("camera", "plane"):
         assert f"#define CALIB_{name.upper()}_OK {int(name not in weak)}" in text

@@ -69,9 +69,14 @@ def _write(files: Files, outcome: Header | Check) -> list[Path]:
 def _document(outcome: Header | Check) -> dict[str, Any]:
     from calib.stages.firmware.header import Header
 
-    gate = outcome.verdict.reasons or "passed"
+    verdict = outcome.verdict
+    judged = {
+        "gate": verdict.reasons or "passed",
+        "remarks": verdict.remarks,
+        "advice": verdict.advice,
+    }
     if isinstance(outcome, Header):
-        return {"constants": len(outcome.literals), "gate": gate}
+        return {"constants": len(outcome.literals), **judged}
     return {
         "check": {
             "ticks": outcome.ticks,
@@ -79,7 +84,7 @@ def _document(outcome: Header | Check) -> dict[str, Any]:
             "worst": outcome.worst,
             "tolerance": outcome.allowed,
             "flags_differ": outcome.flags_differ,
-            "gate": gate,
+            **judged,
         }
     }
 
