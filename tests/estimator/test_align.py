@@ -676,7 +676,10 @@ def swing() -> AlignLog:
     return align_log(twin_log(RIG, "swing", {"phi_rad": "0.5"}, 1))
 
 
-@pytest.mark.parametrize(("factor", "words"), [(57.2958, "in deg/s"), (-1.0, "the other way round")])
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(57.2958, "in deg/s"), (-1.0, "the other way round"), (0.05, "shows 5.0% of the turn")],
+)
 def test_a_gyroscope_in_other_units_is_refused(swing: AlignLog, factor: float, words: str) -> None:
     wrong = replace(swing, readings=swing.readings * np.array([1.0, 1.0, factor]))
     pieces, _ = pieces_of([wrong], NUMBERS, MEAN_ALIGN_START)

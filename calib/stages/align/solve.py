@@ -387,6 +387,8 @@ _LENGTH_M = 0.07
 _PHI_SIGMA = 0.012
 _WORTH = 60.0
 _TIMES_IN_DEGREES = (0.5 / 57.3, 2.0 / 57.3)
+_MOST_FACTOR, _MOST_LEFT = 6.0, 0.1
+"""Of the camera's turn over the gyroscope's, and of the squares that this leaves: z is 80 degrees off."""
 _MARGIN_S = 0.06
 _MOST_SPAN_S = 0.021
 """Longest span of knots, however seldom the IMU is read: with 0.04 s the splines miss the accelerations of a
@@ -602,6 +604,12 @@ def _check_gyro(log: AlignLog, sums: FloatArray) -> None:
     if best > 0.5 or (1.0 - best) * total < _WORTH * _PHI_SIGMA**2:
         return
     factor = float(factors[np.argmin(np.abs(left - best))])
+    if abs(factor) > _MOST_FACTOR and best < _MOST_LEFT:
+        raise BadInputError(
+            f"{log.source}: gz_radps shows {1.0 / abs(factor):.1%} of the turn that the camera sees, "
+            "expected all: the rate about the axis away from the camera, in the unit of columns.yaml; turn "
+            "the IMU on its mount, or name its axes in columns.yaml and in the sketch"
+        )
     if _TIMES_IN_DEGREES[0] < abs(factor) < _TIMES_IN_DEGREES[1]:
         raise BadInputError(
             f"{log.source}: gz_radps turns {1.0 / abs(factor):.3g} times as fast as the camera sees, so it "
