@@ -112,7 +112,7 @@ class PlaneConstants:
         A^-1 K. raw : pixels as the camera reports them to metres; None where the camera sees too little of
         the workspace to fit it.
     least, raw_least : least denominators of the last two in the workspace, times a tenth [1/m].
-    raw_error_m : largest error of `raw` in the workspace.
+    raw_error_m : largest distance that `raw` is off in the workspace.
     verdict : of the plane.
     """
 
@@ -158,7 +158,7 @@ def plane_constants(rig: Rig, source: str) -> PlaneConstants | None:
         raw_least = _HORIZON_SHARE / float(_depths(H, grid).max())
         pixels = plane_pixels(camera, R, t, grid)
         back = apply_homography(raw, pixels) - grid
-        error = float(np.abs(back[in_picture(pixels, camera.image_size_px)]).max())
+        error = float(np.linalg.norm(back[in_picture(pixels, camera.image_size_px)], axis=1).max())
     right = np.eye(3)
     if rig.align is not None:
         shrink, (across, along) = 1.0 / (1.0 + rig.align.plane_stretch), rig.align.plane_shift_m

@@ -146,7 +146,7 @@
 
 /*
  * The same from pixels as the camera reports them, fitted over the workspace, for
- * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.278 mm there.
+ * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.331 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
 #define CALIB_PLANE_RAW_11 0.00369091704f /* row 1, distorted px to m */
