@@ -185,12 +185,15 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
     assert old.parameters == fewer
     assert (old.values_on("a")["lengthens_s"], old.values_on("a")["lengthens_per_kpa"]) == (1.0, 0.0)
     names = [name for name in ("valve", *small.parts) if name != "lag"]
-    plain = dict.fromkeys(set(Assembly(tuple(names)).names) - {"input_s", "pilot_jump_kpa"}, 2.0)
-    old = Rig.of(
-        {"schema": 2, "arm": section | {"verdict": "ok", "parts": names, "parameters": plain}}, "rig.yaml"
-    ).arm
-    assert old is not None
-    assert old.values_on("a")["pilot_jump_kpa"] == NO_JUMP_KPA
+    # Twice without a load, as one rig must not change how another is read.
+    for parts in (names, [*names, "load"], names):
+        later = {"input_s", "pilot_jump_kpa", "compliance_across_rad_per_Nm"}
+        plain = dict.fromkeys(set(Assembly(tuple(parts)).names) - later, 2.0)
+        of = section | {"verdict": "ok", "parts": parts, "parameters": plain}
+        old = Rig.of({"schema": 2, "arm": of}, "rig.yaml").arm
+        assert old is not None
+        assert old.values_on("a")["pilot_jump_kpa"] == NO_JUMP_KPA
+        assert old.values_on("a")["compliance_across_rad_per_Nm"] == 0.0
     with pytest.raises(BadInputError, match=r"expected factors of .*bends_rad_per_kpa, not of lag_s"):
         Rig.of({"arm": section | {"verdict": "ok", "days": {"a": {"lag_s": 1.1}}}}, "rig.yaml")
     with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):

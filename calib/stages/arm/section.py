@@ -85,7 +85,7 @@ class Arm(Result):
         }
         out, parameters = section | {"days": days}, section.get("parameters")
         if isinstance(parameters, dict):
-            earlier = _PLAIN_VALVE if "leak_per_s" in parameters else {}
+            earlier = dict(_PLAIN_VALVE) if "leak_per_s" in parameters else {}
             earlier |= dict.fromkeys(COMPLIANCE[1:], 0.0) if COMPLIANCE[0] in parameters else {}
             out["parameters"] = earlier | parameters
         return out
