@@ -34,7 +34,7 @@ _MOUNTED_RAD = math.radians(60.0)
 """A turn at the start that is a body's mount: no arm rests so far bent."""
 _TILTED_RAD = math.radians(5.0)
 _LEAST_TURN_RAD = math.radians(0.5)
-_PLANE = 3.0
+_PLANE = 5.0
 """Times its thickness that the path of a tip is wide, where it tells a plane."""
 _NO_PLANE_RAD = math.radians(45.0)
 _LONGEST_M, _MOST_KPA, _LEAST_KPA, _MOST_TURN_RAD = 3.0, 2000.0, 5.0, 2.0 * math.pi
