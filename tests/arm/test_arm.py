@@ -37,6 +37,7 @@ from calib.stages.arm.model import (
     Trial,
     drive_run,
     load_bends,
+    scale_of,
     segment_run,
     values_on,
 )
@@ -110,6 +111,29 @@ def test_a_pilot_crosses_the_overlap_in_its_time(jump_kpa: float, drains_s: floa
     up = replace(trial, command=np.where(np.arange(n) < half, 20.0, 220.0))
     rises = float(np.argmax(drive_run(up, fast) > 121.0) - half) * STEP_S
     assert rises == pytest.approx(0.5 * fills_s, abs=0.03)
+
+
+def test_a_pump_fills_until_its_flow_leaves_by_the_orifice() -> None:
+    pump = {
+        "delivers_per_s": 0.5,
+        "dead_command": 40.0,
+        "stalls_kpa": 60.0,
+        "orifice_per_s": 0.2,
+        "seeps_per_s": 0.1,
+    }
+    n, none = 3000, np.zeros(0)
+    for command, delivers in ((30.0, 0.0), (200.0, 80.0)):
+        trial = Trial("a", "a", 0.0, STEP_S * np.arange(n), np.full(n, command), none, none, none, pwm=True)
+        kpa = drive_run(trial, pump)[-1]
+        ratio = 101.3 / (kpa + 101.3)
+        psi = math.sqrt(1.0 - ((ratio - 0.3) / 0.7) ** 2)
+        leaves = 0.2 * (kpa + 101.3) * psi + 0.1 * kpa
+        assert delivers * (1.0 - kpa / 60.0) == pytest.approx(leaves, rel=0.01, abs=0.1)
+    # What it delivers is told by no angle; its size is that of the air.
+    assert (
+        scale_of([replace(trial, angle_rad=np.linspace(0.0, 0.5, n), chord_m=np.full(n, 0.2))]).pressure_kpa
+        > 100.0
+    )
 
 
 def test_a_load_bends_an_upright_arm_further() -> None:
@@ -198,7 +222,7 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
         Rig.of({"arm": section | {"verdict": "ok", "days": {"a": {"lag_s": 1.1}}}}, "rig.yaml")
     with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):
         Rig.of({"actuator": section, "arm": section}, "rig.yaml")
-    with pytest.raises(BadInputError, match=r"rig\.yaml: actuator.*expected one part of valve and lag"):
+    with pytest.raises(BadInputError, match=r"rig\.yaml: actuator.*expected one part of valve, lag, pump"):
         Rig.of(
             {"schema": 2, "actuator": section | {"verdict": "ok", "parts": ["segment", "chord"]}}, "rig.yaml"
         )

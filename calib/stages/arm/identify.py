@@ -45,7 +45,7 @@ from calib.stages.arm.model import (
     values_on,
 )
 
-FULL = Assembly(tuple(part.name for part in PARTS if part.name != "lag"))
+FULL = Assembly(tuple(part.name for part in PARTS if part.name not in ("lag", "pump")))
 WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
 _SIGMA = {"pressure_kpa": 0.03, "angle_rad": 0.027, "chord_m": 0.0045}
@@ -512,21 +512,21 @@ def identify(
     """
     scale = scale_of(trials)
     assembly = FULL if any(one.load_kg > 0.0 for one in trials) else FULL.without("load")
-    if any(one.pwm for one in trials):
-        assembly = assembly.driven_by("lag")
+    # A regulator that follows its command is none of the valves that integrate, and a lag is no orifice.
+    drive, other_drive = ("lag", "pump") if any(one.pwm for one in trials) else ("valve", "lag")
+    assembly = assembly.driven_by(drive)
     scale, held = _held(trials, assembly, scale) if len(trials) > 1 else (scale, {})
     errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
     others: dict[str, Mapping[str, Errors]] = {}
-    if held and "valve" in assembly.parts and any(len(one.command) for one in trials):
-        # A regulator that follows its command is none of the valves that integrate.
-        lag = assembly.driven_by("lag")
-        fits = held_fits(trials, lag, scale, held)
-        by_lag = {one.name: errors_of(fits[one.name], one) for one in trials}
-        if mean_of(by_lag, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
-            others["a valve for the lag"] = errors
-            assembly, held, errors = lag, fits, by_lag
+    if held and any(len(one.command) for one in trials):
+        driven = assembly.driven_by(other_drive)
+        fits = held_fits(trials, driven, scale, held)
+        by_other = {one.name: errors_of(fits[one.name], one) for one in trials}
+        if mean_of(by_other, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
+            others[f"a {drive} for the {other_drive}"] = errors
+            assembly, held, errors = driven, fits, by_other
         else:
-            others["a lag for the valve"] = by_lag
+            others[f"a {other_drive} for the {drive}"] = by_other
     variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}
     chosen = variants if compare and len(trials) > 1 else {}
     steps = 2 + len(chosen)

@@ -17,6 +17,11 @@ A valve that has held a pressure makes up for its leak, so the pilot begins wher
 
 Lag, in place of a valve, as of a pump under PWM: dp/dt = (G u - p) / t, with one time up and another down.
 
+Pump, in place of both: it delivers less the higher the pressure, up to p_m at which it stalls. The chamber
+empties through an orifice and seeps:
+
+    dp/dt = F max(u - d, 0) (1 - p / p_m) - E (p + P_0) psi(P_0 / (p + P_0)) - l p
+
 Segment: the chamber of the arm fills, p_f, with the fill time. The angle phi [rad] follows its rest value
 with one viscous lag; inertia plays no part at the speeds of such arms. Pressure stiffens, so that the moments
 of pressure, load and hysteresis bend less under it. w is a stop, the elastic part of the angle's changes, of
@@ -170,6 +175,18 @@ PARTS = (
         drives=True,
     ),
     Part(
+        "pump",
+        (
+            Parameter("delivers_per_s", "kPa/s", 1.5, 0.8, True, (1, 0, 0, -1), identified_by="steps up"),
+            Parameter("dead_command", "", 0.1, 0.1, powers=(0, 0, 0, 1), identified_by="small commands"),
+            Parameter("stalls_kpa", "kPa", 2.0, 0.5, True, _P, identified_by="long steps"),
+            Parameter("orifice_per_s", "1/s", 0.3, 0.8, True, identified_by="steps down"),
+            Parameter("seeps_per_s", "1/s", 0.3, 0.8, True, identified_by="steps down to zero"),
+        ),
+        {},
+        drives=True,
+    ),
+    Part(
         "segment",
         (
             Parameter("rest_rad", "rad", -0.1, 0.05, powers=_A, identified_by="rest"),
@@ -254,7 +271,7 @@ DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PART
 CHORD = tuple(one.name for part in PARTS if part.name == "chord" for one in part.parameters)
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
 COMPLIANCE = tuple(one.name for part in PARTS if part.name == "load" for one in part.parameters)
-DAILY = {"pilot_drains": 0.1, "kpa_per_command": 0.1, "bends_rad_per_kpa": 0.15}
+DAILY = {"pilot_drains": 0.1, "kpa_per_command": 0.1, "delivers_per_s": 0.1, "bends_rad_per_kpa": 0.15}
 """Parameters that differ from day to day, and standard deviations of the logarithms of a day's factors."""
 Days = Mapping[str, Mapping[str, float]]
 """Factors of parameters by day."""
@@ -360,6 +377,23 @@ def _lag(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
 
 
 @kernel()
+def _pump(command: FloatArray, start_kpa: float, q: FloatArray) -> FloatArray:
+    delivers, dead, stalls, orifice, seeps = q
+    out = np.empty(len(command))
+    pressure = start_kpa
+    step_s = STEP_S / _FINER
+    for k in range(len(command)):
+        out[k] = pressure
+        flow = delivers * max(command[k] - dead, 0.0)
+        for _ in range(_FINER):
+            inside = max(pressure, 0.0) + _AIR_KPA
+            leaves = orifice * inside * _nozzle(_AIR_KPA / inside) / max(pressure, 1e-2)
+            # Implicit, over the drop that drives the flow.
+            pressure = (pressure + step_s * flow) / (1.0 + step_s * (flow / stalls + leaves + seeps))
+    return out
+
+
+@kernel()
 def load_bends(angle_rad: float, compliance: float, across: float) -> float:
     """By how much a moment of 1 N m of a load at the tip, across the straight arm, bends it [rad]."""
     lean = _LEANS * angle_rad
@@ -407,7 +441,8 @@ def drive_run(trial: Trial, values: Mapping[str, float]) -> FloatArray:
     """
     name = next(one for one, names in DRIVES.items() if names[0] in values)
     q = np.array([values[one] for one in DRIVES[name]])
-    return np.asarray((_valve if name == "valve" else _lag)(trial.command, trial.begins[0], q))
+    run = {"valve": _valve, "lag": _lag, "pump": _pump}[name]
+    return np.asarray(run(trial.command, trial.begins[0], q))
 
 
 def segment_run(
@@ -452,15 +487,16 @@ class Assembly:
 
 
 def scale_of(trials: Sequence[Trial]) -> Scale:
-    """Size of what trials hold. Where no pressure was logged its size is that of the command."""
+    """Size of what trials hold; that of a pressure without one is of the command, under a pump of the air."""
     commands = [one.command for one in trials if len(one.command)]
     pressures = [one.pressure_kpa for one in trials if len(one.pressure_kpa)]
     angles = np.concatenate([one.angle_rad for one in trials])
     chords = np.concatenate([one.chord_m for one in trials])
     low, high = (float(x) for x in np.percentile(angles, (1.0, 99.5))) if len(angles) else (0.0, 1.0)
     command = max((float(x.max()) for x in commands), default=1.0)
+    logged = [float(x.max()) for x in pressures] + [command] * (not all(one.pwm for one in trials))
     return Scale(
-        max([float(x.max()) for x in pressures] + [command] * (not all(one.pwm for one in trials))),
+        max(logged, default=_AIR_KPA),
         high - low,
         float(chords.max()) if len(chords) else 1.0,
         low,

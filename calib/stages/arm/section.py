@@ -97,7 +97,7 @@ class Arm(Result):
         if any(one not in known for one in self.parts) or any(one not in self.parts for one in needed):
             raise ValueError(f"expected parts of {', '.join(known)}, with {', '.join(needed)}")
         if sum(one in DRIVES for one in self.parts) != 1:
-            raise ValueError(f"expected one part of {' and '.join(DRIVES)}")
+            raise ValueError(f"expected one part of {', '.join(DRIVES)}")
         if set(self.parameters) | set(_AS_SETTLING) != set(self.assembly.names):
             raise ValueError("expected the parameters of its parts, all of them")
         strange = {name for day in self.days.values() for name in day} - set(DAILY)

@@ -190,6 +190,13 @@ def judge(found: Identification) -> Iterator[Finding]:
             "look at the logs' days, loads and units",
         )
     yield from _far(found)
+    if all(one.pwm and not len(one.pressure_kpa) for one in found.trials):
+        yield Finding(
+            "remark",
+            f"no log has a pressure: parameters in kPa count as if the greatest was "
+            f"{found.fit.scale.pressure_kpa:.0f} kPa",
+            "log p1_kpa, where they matter",
+        )
     yield from _untold(found)
     if len({one.day for one in found.trials}) == 1:
         share = DAILY["bends_rad_per_kpa"]
