@@ -88,6 +88,8 @@ extern "C" {
 #define CALIB_GUARD_SAME_ONE 72
 #define CALIB_GUARD_SHAKEN_MPS2 30.0f /* specific force that a rig has for moments only */
 #define CALIB_GUARD_FROZEN_RAD 0.25f /* angle that moves the marker by pixels */
+/* The fused angle follows the pictures: from the accelerometer's, on the mean of some 30 ticks. */
+#define CALIB_GUARD_LEANS_RAD 0.2f
 #define CALIB_GUARD_FROZEN 6
 #define CALIB_GUARD_APART (8 * CALIB_GUARD_BAD) /* in fourths of the ticks, as the rate */
 #define CALIB_GUARD_REACH (6 * CALIB_GUARD_BAD)
@@ -97,6 +99,9 @@ typedef struct {
     uint32_t imu[3], pixel[2];            /* bits of the last sample, and of the last marker */
     float marker_m[2], tangent;           /* of the last fourth tick: marker, tangent of half the angle */
     float phi_rad;                        /* angle when the marker came to that pixel */
+#if CALIB_FUSED
+    float leans_rad;                      /* mean pull of the accelerometer */
+#endif
     float q_m[2];                         /* lengths four ticks ago */
     uint16_t full[2];                     /* ticks at full power, less those below it */
     uint16_t on[2];                       /* ticks in open loop with a command, less four times those without */
@@ -256,8 +261,16 @@ static inline uint8_t calib_guard_camera(calib_guard *guard, const calib_state *
     } else if (guard->turn == 1 && guard->shown) {
         float across = guard->marker_m[0] - guard->tangent * (guard->marker_m[1] + CALIB_MARKER_OFFSET_M);
         uint8_t off = (uint8_t)!calib_within(across, CALIB_ENVELOPE_APART_M);
+#if CALIB_FUSED
+        off = (uint8_t)(off || !calib_within(guard->leans_rad, CALIB_GUARD_LEANS_RAD * CALIB_FUSED_ACCEL_GAIN));
+#endif
         guard->apart = calib_guard_counted(guard->apart, off, CALIB_GUARD_APART);
     }
+#if CALIB_FUSED
+    if (guard->turn == 3) {
+        guard->leans_rad = state->pull_rad + 0.875f * (guard->leans_rad - state->pull_rad);
+    }
+#endif
     if (guard->camera_bad >= CALIB_GUARD_CAMERA_BAD) {
         return CALIB_FAULT_CAMERA_LOST;
     }
@@ -368,6 +381,9 @@ static inline void calib_trial_sound(calib_trial *of, uint8_t k) {
     uint8_t third = (uint8_t)(k % 6u);
     of->state.imu_age = 0;
     of->state.marker_age = (uint16_t)((k & 15u) == 15u);
+#if CALIB_FUSED
+    of->state.pull_rad = 0.0f;
+#endif
     of->in.imu_read = 1;
     of->in.ax_mps2 = (uint8_t)(third - 1u) < 3u ? 9.01f : 9.0f;
     of->in.ay_mps2 = (uint8_t)(third - 2u) < 3u ? 0.51f : 0.5f;
@@ -464,6 +480,12 @@ static inline uint16_t calib_guard_try(calib_trial *of, uint8_t fault, uint8_t k
             of->out.phi_rad -= k + kind > 2 ? 0.2525f : 0.0f;
             break;
         case CALIB_FAULT_APART:
+#if CALIB_FUSED
+            if (kind == 2) {
+                of->state.pull_rad = -CALIB_FUSED_ACCEL_GAIN;
+                break;
+            }
+#endif
             of->out.marker_m[0] += kind ? -1.004f * CALIB_ENVELOPE_APART_M : 1.004f * CALIB_ENVELOPE_APART_M;
             break;
         case CALIB_FAULT_REFERENCE:
@@ -589,7 +611,7 @@ static inline uint8_t calib_guard_patient(calib_trial *of) {
 
 /* 0 when every fault stops the pumps in its tick and no longer, else the number of the first that does not. */
 static inline uint8_t calib_guard_selftest(void) {
-    /* Fault, kind, tick, ticks until it is over. The last is not of the fused estimator, which always needs the camera. */
+    /* Fault, kind, tick, ticks until it is over. The fused estimator always needs the camera, and has one kind more. */
     static const uint8_t tries[25][4] = {
         {CALIB_FAULT_IMU_LOST, 0, 12, 107},     {CALIB_FAULT_IMU_LOST, 1, 31, 107},
         {CALIB_FAULT_IMU_FROZEN, 0, 13, 61},    {CALIB_FAULT_IMU_FROZEN, 1, 71, 61},
@@ -605,10 +627,14 @@ static inline uint8_t calib_guard_selftest(void) {
         {CALIB_FAULT_RATE, 0, 11, 30},          {CALIB_FAULT_RATE, 1, 11, 30},
         {CALIB_FAULT_FULL_POWER, 0, 4, 30},     {CALIB_FAULT_FULL_POWER, 1, 4, 30},
         {CALIB_FAULT_LONG, 0, 3, 30},           {CALIB_FAULT_LONG, 1, 3, 30},
+#if CALIB_FUSED
+        {CALIB_FAULT_APART, 2, 38, 98}};
+#else
         {CALIB_FAULT_NONE, 0, 1, 0}};
+#endif
     static calib_trial trial;
     uint8_t i;
-    for (i = 0; i < (CALIB_FUSED ? 24 : 25); i++) {
+    for (i = 0; i < 25; i++) {
         if (calib_guard_try(&trial, tries[i][0], tries[i][1]) != tries[i][2] + 256u * tries[i][3]) {
             return (uint8_t)(i + 1u);
         }

@@ -179,7 +179,7 @@ def test_the_budget_of_the_fused_tick(tmp_path: Path) -> None:
         assert _told(name, found.extra) <= budget(most)
         print(f"  {sizes}, stack {found.stack}")
         assert sizes["flash"] <= (10_240 if "-DCALIB_GUARDED" in flags else 8192)
-        assert sizes["ram"] + found.stack <= 300
+        assert sizes["ram"] + found.stack <= 310
 
 
 def _with_integral(plain: Rig) -> Rig:

@@ -5,20 +5,22 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from firmware_board import Board
-from firmware_build import Built, need, sketch, warnings, write
+from firmware_build import Built, host, need, run, sketch, warnings, write
 from firmware_rigs import header, rig
 
 from calib.core.rig import Rig
 from calib.io.serial import FAULTS as FAULT_WORDS
-from calib.io.serial import GUARD_FAULT, GUARD_RUN, Decoder, Frame
+from calib.io.serial import GUARD_FAULT, GUARD_RUN, MODE_POSITION, Decoder, Frame, Inputs
 from calib.stages.firmware.check import check_frames
+from calib.stages.firmware.conformance import binary32
 from calib.stages.firmware.header import header_of, verbatim
+from calib.stages.firmware.vectors import coherent
 from calib.twin.pictures import CAMERA, PLANE
 
 IMU_LOST, IMU_FROZEN, CAMERA_LOST, CAMERA_FROZEN, APART, REFERENCE = range(1, 7)
@@ -298,6 +300,28 @@ def test_a_slow_pump_may_fill_its_bellows_at_full_power() -> None:
     # Four lags: the force is 2 % from where it settles.
     assert full_s(slow) == 8.0
     assert full_s({**slow, "envelope": {"full_power_s": 1.0}}) == 1.0
+
+
+@pytest.mark.parametrize("aside_px", [0.0, 15.0, -30.0])
+def test_the_fused_angle_does_not_follow_another_thing_for_long(tmp_path: Path, aside_px: float) -> None:
+    """It followed it for 12 s, and the marker agreed with that angle: lengths were 20 mm off."""
+    write(tmp_path, header("fused"))
+    command = host(tmp_path, "-DCALIB_FUSED=1", "-DCALIB_GUARDED=1")
+    rested = coherent(header("fused").values, 480, lateness=lambda _: 0.0)[-1]
+    # A little longer, so that pumps run below full power.
+    still = replace(rested, reference=(0.0693, 0.0693), mode=MODE_POSITION)
+
+    def at(k: int) -> Inputs:
+        shaken = 0.02 * (-1) ** k * (1 + k % 5)
+        u = still.u_px + 0.1 * (k % 3) + (aside_px if k >= 300 else 0.0)
+        return binary32(
+            replace(still, u_px=u, ax_mps2=still.ax_mps2 + shaken, gz_radps=still.gz_radps + 0.01 * shaken)
+        )
+
+    duty = run(command, [at(k) for k in range(480)]).duty
+    assert duty[290].any()
+    # Eighty ticks, and none runs on.
+    assert duty[380:].any() == (aside_px == 0.0)
 
 
 def test_a_log_knows_every_fault_of_the_guard() -> None:

@@ -154,6 +154,7 @@ typedef struct {
     float bias_rad, half_rad;             /* what the gyroscope turns too little in a tick; T / 2 times its rate */
     float length_m, rate_m, slow_m;       /* length, its change in a tick, mean residual */
     float turned_rad[CALIB_PAST_TICKS];   /* what the gyroscope turned in the last ticks, the oldest first */
+    float pull_rad;                       /* the accelerometer's pull in this tick, for the guard */
     uint8_t boost, moving, rejected;
 #else
     float integral_rad;                   /* J of (2.3), from the gyroscope's known bias on */
@@ -674,6 +675,7 @@ static inline uint16_t calib_fuse(calib_state *state, const calib_inputs *in, ca
         /* B cos(then) - A sin(then), which is the angle's error of then, seen now. */
         c = B - (sh + sh) * (B * sh + A * ch) - CALIB_FUSED_ACCEL_GAIN * (phi - then);
         c = calib_clip(c, CALIB_FUSED_ACCEL_GAIN);
+        state->pull_rad = c;
     }
     CALIB_STAGE(4);
     state->length_m += state->rate_m;
