@@ -200,8 +200,9 @@ def are_states(names: tuple[str, ...]) -> bool:
 
 
 def is_arm_log(names: Sequence[str]) -> bool:
-    """Whether columns are those of an arm that pressures drive."""
-    return bool({*COMMANDED, *PRESSURES} & set(names))
+    """Whether columns are those of an arm that pressures drive, or a pump that no camera watches."""
+    pump = {*QUATERNION} <= set(names) and not {*PWM}.isdisjoint(names) and "u_px" not in names
+    return pump or bool({*COMMANDED, *PRESSURES} & set(names))
 
 
 def known_name(name: str) -> tuple[str, str] | None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.columns import known_name
+from calib.io.columns import QUATERNION, is_arm_log, known_name
 from calib.io.logs import Log, read_log
 from calib.stages.arm.identify import (
     FULL,
@@ -526,7 +526,7 @@ def test_quaternions_in_another_order_are_told() -> None:
 def test_what_is_no_single_driven_arm_is_refused() -> None:
     trial = simulated("a", 1)
     both = columns_of(trial) | {"p_cmd2_kpa": trial.command}
-    with pytest.raises(BadInputError, match="p_cmd1_kpa, p_cmd2_kpa change, expected one driven chamber"):
+    with pytest.raises(BadInputError, match=r"p_cmd1_kpa, p_cmd2_kpa change, expected one .* one is driven"):
         recording_of(_log(both, trial), "a")
     bad = columns_of(trial)
     bad["tip_qw"] = 2.0 * bad["tip_qw"]
@@ -541,6 +541,8 @@ def test_pressures_are_read_by_their_unit(tmp_path: Path) -> None:
     assert known_name("base_x_mm") == ("base_x_m", "mm")
     assert known_name("tip phi [deg]") == ("tip_phi_rad", "deg")
     assert known_name("tip_x") is None
+    assert is_arm_log(["t_s", "p1_kpa"]) and is_arm_log(["t_s", "pwm2", *QUATERNION])
+    assert not is_arm_log(["t_s", "pwm1", "u_px", *QUATERNION]) and not is_arm_log(["pwm1", "tip_x_m"])
     rows = "\n".join(f"{0.01 * k:.2f},{k % 7}" for k in range(40))
     (tmp_path / "a.csv").write_text(f"t_s,p1_psi\n{rows}\n", encoding="utf-8")
     assert read_log(tmp_path / "a.csv").columns["p1_kpa"][1] == pytest.approx(6.894757)

@@ -457,8 +457,9 @@ def _read_validate(
     from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
 
     logs = _with_states(files, options)
-    an_arm = rig.arm is not None and rig.actuator is None
-    if an_arm or all(is_arm_log(columns_of(path, options) or ()) for path in files.paths):
+    if (rig.arm is not None and rig.actuator is None) or all(
+        is_arm_log(columns_of(path, options) or ()) for path in files.paths
+    ):
         arm = rig.needed("arm", files.rig_path)
         files.hashes |= rig.identities("arm")
         # An arm's trials are read by its own stage.

@@ -182,7 +182,8 @@ def _driven(log: Log) -> int:
             return moving[0]
         if moving:
             raise BadInputError(
-                f"{log.source}: {', '.join(names[k] for k in moving)} change, expected one driven chamber"
+                f"{log.source}: {', '.join(names[k] for k in moving)} change, expected one driven chamber; "
+                "an arm is not identified by several at once: record trials in which one is driven"
             )
     raise BadInputError(f"{log.source}: no command and no pressure changes, expected one driven chamber")
 
