@@ -373,6 +373,13 @@ def test_the_tuned_table_balances_the_springs() -> None:
         assert np.interp(c[f"calib_ff_table_pwm[{i}]"], pwm, force) == pytest.approx(wanted, rel=1e-5)
 
 
+def test_pumps_without_strength_are_refused_by_their_key() -> None:
+    document = rig("full").values()
+    document["controller"]["feedforward"]["strength"] = [1.0, 0.0]
+    with pytest.raises(BadInputError, match=r"controller\.feedforward\.strength\.1 is 0, expected above 0"):
+        Rig.of(document, "rig.yaml")
+
+
 def _with(section: str, **changes: object) -> Rig:
     whole = rig("fused")
     return whole.with_sections({section: getattr(whole, section).model_copy(update=changes)})

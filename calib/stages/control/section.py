@@ -74,7 +74,7 @@ class StaticMap(Section):
     bellows_radius_m: Positive = Field(le=0.2)
     stiffness_N_per_m: Annotated[list[Number], Field(min_length=4, max_length=4)]
     bending_N_per_rad2: NotNegative
-    strength: Pair
+    strength: Annotated[list[Positive], Field(min_length=2, max_length=2)]
     force_pwm: Annotated[list[Pair], Field(min_length=2, max_length=64)]
 
     @field_validator("force_pwm")
