@@ -252,7 +252,12 @@ static inline uint8_t calib_guard_camera(calib_guard *guard, const calib_state *
         }
     }
     if (guard->turn == 0) {
+#if CALIB_FUSED
         float phi = out->phi_rad;
+#else
+        /* When the picture was exposed: a head that swings before a slow camera is elsewhere by now. */
+        float phi = state->past_rad[0];
+#endif
         /* The tangent of half the angle, to 0.03 up to 1.4 rad. */
         guard->tangent = phi * (0.5f + phi * phi * 0.0416666679f);
         guard->marker_m[0] = out->marker_m[0];
@@ -383,6 +388,8 @@ static inline void calib_trial_sound(calib_trial *of, uint8_t k) {
     of->state.marker_age = (uint16_t)((k & 15u) == 15u);
 #if CALIB_FUSED
     of->state.pull_rad = 0.0f;
+#else
+    of->state.past_rad[0] = phi;
 #endif
     of->in.imu_read = 1;
     of->in.ax_mps2 = (uint8_t)(third - 1u) < 3u ? 9.01f : 9.0f;

@@ -324,6 +324,19 @@ def test_the_fused_angle_does_not_follow_another_thing_for_long(tmp_path: Path, 
     assert duty[380:].any() == (aside_px == 0.0)
 
 
+def test_a_swing_before_a_slow_camera_is_no_other_thing(tmp_path: Path) -> None:
+    """Pictures are eight ticks late; the marker is where the angle was."""
+    whole = rig("fused")
+    assert whole.align is not None
+    late = whole.align.model_copy(update={"time_offset_s": 8.0 / 60.0})
+    made = header_of(whole.with_sections({"align": late}), "rig.yaml")
+    write(tmp_path, made)
+    ticks = coherent(made.values, 480, lateness=lambda _: 0.0)
+    given = [binary32(replace(one, reference=(0.07, 0.07), mode=MODE_POSITION)) for one in ticks]
+    duty = run(host(tmp_path, "-DCALIB_GUARDED=1"), given).duty
+    assert duty[60:130].any(axis=1).mean() > 0.9
+
+
 def test_a_log_knows_every_fault_of_the_guard() -> None:
     names = re.findall(r"#define CALIB_FAULT_(\w+) (\d+)", verbatim("calib_guard.h"))
     numbers = {int(number) for name, number in names if name not in ("NONE", "STAYS")}
