@@ -136,6 +136,19 @@ def test_a_pump_fills_until_its_flow_leaves_by_the_orifice() -> None:
     )
 
 
+def test_an_arm_of_some_inertia_swings_about_where_it_comes_to_rest() -> None:
+    values = FULL.without("hysteresis", "creep", "load", "settling").values(np.zeros(len(PARAMETERS)), SCALE)
+    n, none = 1500, np.zeros(0)
+    t = STEP_S * np.arange(n)
+    start = Trial("a", "a", 0.0, t, none, np.where(t < 1.0, 0.0, 100.0), np.full(3, 0.13), np.full(3, 0.17))
+    still, _ = segment_run(start, values, start.pressure_kpa)
+    swings, _ = segment_run(start, values | {"swings_s": 0.2, "damps": 0.03}, start.pressure_kpa)
+    assert swings.max() > still.max() + 0.3 * (still.max() - still[0])
+    assert swings[-1] == pytest.approx(still[-1], abs=1e-3)
+    high = np.flatnonzero((swings[1:-1] > swings[:-2]) & (swings[1:-1] > swings[2:]) & (t[1:-1] > 1.5))[:3]
+    assert np.diff(t[high]).mean() == pytest.approx(2.0 * math.pi * 0.2, rel=0.05)
+
+
 def test_a_load_bends_an_upright_arm_further() -> None:
     plain, loaded = simulated("a", 1), simulated("a", 1, load_kg=0.2)
     assert loaded.angle_rad[1000:].mean() > plain.angle_rad[1000:].mean() + math.radians(0.5)

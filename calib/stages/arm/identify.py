@@ -45,7 +45,7 @@ from calib.stages.arm.model import (
     values_on,
 )
 
-FULL = Assembly(tuple(part.name for part in PARTS if part.name not in ("lag", "pump")))
+FULL = Assembly(tuple(part.name for part in PARTS if part.name not in ("lag", "pump", "inertia")))
 WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
 _SIGMA = {"pressure_kpa": 0.03, "angle_rad": 0.027, "chord_m": 0.0045}
@@ -400,6 +400,13 @@ _WORTHWHILE = 0.8
 """Held error with smaller errors, of that with the usual ones, that speaks for them."""
 
 
+def _error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
+    """Mean error of the held trials' angle by what drives the segment most closely."""
+    errors = {one.name: errors_of(held[one.name], one) for one in trials}
+    means = [mean_of(errors, name) for name in ("angle_by_pressure_rad", "angle_rad")]
+    return next((x for x in means if math.isfinite(x)), math.inf)
+
+
 def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Scale, dict[str, Fit]]:
     """Fits to all trials but one, and the scale of errors that predicts these best.
 
@@ -407,17 +414,12 @@ def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Sc
     tells so by its held trials, and the priors give way to them.
     """
 
-    def error(held: Mapping[str, Fit]) -> float:
-        errors = {one.name: errors_of(held[one.name], one) for one in trials}
-        means = [mean_of(errors, name) for name in ("angle_by_pressure_rad", "angle_rad")]
-        return next((x for x in means if math.isfinite(x)), math.inf)
-
     best = last = held_fits(trials, assembly, scale)
-    least = _WORTHWHILE * error(best)
+    least = _WORTHWHILE * _error(trials, best)
     for finer in _FINER:
         other = replace(scale, finer=finer)
         last = held_fits(trials, assembly, other, last)
-        if (reached := error(last)) <= least:
+        if (reached := _error(trials, last)) <= least:
             scale, best, least = other, last, reached
     return scale, best
 
@@ -527,6 +529,13 @@ def identify(
             assembly, held, errors = driven, fits, by_other
         else:
             others[f"a {other_drive} for the {drive}"] = by_other
+    if held and any(len(one.angle_rad) for one in trials):
+        swings = Assembly((*assembly.parts, "inertia"))
+        if _error(trials, held_fits(trials, swings, scale)) <= _WORTHWHILE * _error(trials, held):
+            others["without inertia"] = errors
+            assembly = swings
+            scale, held = _held(trials, assembly, replace(scale, finer=1.0))
+            errors = {one.name: errors_of(held[one.name], one) for one in trials}
     variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}
     chosen = variants if compare and len(trials) > 1 else {}
     steps = 2 + len(chosen)

@@ -23,13 +23,14 @@ empties through an orifice and seeps:
     dp/dt = F max(u - d, 0) (1 - p / p_m) - E (p + P_0) psi(P_0 / (p + P_0)) - l p
 
 Segment: the chamber of the arm fills, p_f, with the fill time. The angle phi [rad] follows its rest value
-with one viscous lag; inertia plays no part at the speeds of such arms. Pressure stiffens, so that the moments
-of pressure, load and hysteresis bend less under it. w is a stop, the elastic part of the angle's changes, of
-at most the hysteresis' range; c creeps after the angle; s is by how much the chord is too short at the start,
-as of an arm that was vented, and s' is that of the chord, which recovers in a time of its own:
+with one viscous lag; of an arm that swings the inertia T plays a part and a share z of the lag is left, of
+others T = 0 and z = 1. Pressure stiffens, so that the moments of pressure, load and hysteresis bend less
+under it. w is a stop, the elastic part of the angle's changes, of at most the hysteresis' range; c creeps
+after the angle; s is by how much the chord is too short at the start, as of an arm that was vented, and s' is
+that of the chord, which recovers in a time of its own:
 
     dp_f/dt = (p - p_f) / t_f
-    tau dphi/dt = phi_0 + (a p_f + m g l W(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
+    T^2 d2phi/dt2 + z tau dphi/dt = phi_0 + (a p_f + m g l W(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
     dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s,  s' as s
 
 W = C sin(.55 phi) + D cos(.55 phi) is by how much the moment m g l of a load at the tip of an arm of length l
@@ -195,6 +196,14 @@ PARTS = (
             Parameter("lag_s", "s", 1.8, 0.4, True, identified_by=_STEPS),
         ),
         {},
+    ),
+    Part(
+        "inertia",
+        (
+            Parameter("swings_s", "s", 0.15, 0.6, True, identified_by=_STEPS),
+            Parameter("damps", "", 0.1, 1.0, True, identified_by=_STEPS),
+        ),
+        {"swings_s": 0.0, "damps": 1.0},
     ),
     Part(
         "stiffening",
@@ -402,12 +411,28 @@ def load_bends(angle_rad: float, compliance: float, across: float) -> float:
 
 @kernel()
 def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, moment: float) -> FloatArray:
-    rest, linear, fill, lag, stiffens, stop, reach, creep, creep_s, vented, settling_s, sooner = q[:12]
-    compliance, across, c0, c1, c2, lengthens_s, longer = q[12:]
+    (
+        rest,
+        linear,
+        fill,
+        lag,
+        swings,
+        damps,
+        stiffens,
+        stop,
+        reach,
+        creep,
+        creep_s,
+        vented,
+        settling_s,
+        sooner,
+    ) = q[:14]
+    compliance, across, c0, c1, c2, lengthens_s, longer = q[14:]
     out = np.empty((len(pressure), 2))
     short = lacks = c0 + c1 * angle + c2 * angle * angle - chord
     elastic, crept = 0.0, 0.0
-    inside = pressure[0]
+    inside, rate = pressure[0], 0.0
+    squared = max(swings, 0.02) ** 2
     follows, fills = 1.0 - math.exp(-STEP_S / lag), 1.0 - math.exp(-STEP_S / fill)
     for k in range(len(pressure)):
         out[k, 0] = angle
@@ -416,7 +441,11 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         weighs = moment * load_bends(angle, compliance, across)
         bends = linear * inside + weighs - stop * elastic / reach
         aim = rest + bends / max(1.0 + stiffens * inside, 0.1)
-        change = follows * (aim + creep * crept + vented * short - angle)
+        lacking = aim + creep * crept + vented * short - angle
+        change = follows * lacking
+        if swings > 0.0:
+            rate = (squared * rate + STEP_S * lacking) / (squared + STEP_S * damps * lag)
+            change = STEP_S * rate
         angle += change
         elastic = min(max(elastic + change, -reach), reach)
         crept += STEP_S / creep_s * (angle - rest - crept)
