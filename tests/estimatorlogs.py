@@ -9,13 +9,15 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.io.logs import Log
+from calib.stages.actuator.dynamics import coefficients
+from calib.stages.actuator.simulate import derivative, state_row
 from calib.stages.estimator.kinematic import Kinematic, Rows, Setup, Start
 from calib.stages.estimator.read import periods, rows_of
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.sensors import Tracker
-from calib.twin.simulate import log_of
+from calib.twin.sensors import Tracker, Trajectory
+from calib.twin.simulate import _NODES_PER_TICK, Run, Sensors, _Plant, log_of
 
 SCENARIOS = {
     "static": ("static", 15.0),
@@ -141,3 +143,36 @@ def setup_for(
 def truth(log: Log) -> FloatArray:
     """True q1, q2, phi (n, 3)."""
     return np.stack([log.columns[name] for name in ("true_q1_m", "true_q2_m", "true_phi_rad")], axis=1)
+
+
+def pushed_log(seed: int, seconds: float = 15.0) -> Log:
+    """A log without commands of a head that a hand pushes along, here and there, and hardly turns."""
+    rig, rng = SimulatedRig(), np.random.default_rng(seed)
+    ticks, node_s = round(60.0 * seconds), rig.pump.tick_s / _NODES_PER_TICK
+    t = node_s * np.arange(_NODES_PER_TICK * ticks + 1)
+    # Length and angle with their first two derivatives, along paths of least jerk.
+    path = np.zeros((2, 3, len(t)))
+    for (place, rate, change), middle, reach in zip(path, (0.065, 0.0), (6e-3, 0.05), strict=True):
+        at, place[:] = 2.0, middle
+        while at < t[-1]:
+            lasts_s, way = rng.uniform(0.25, 1.0), middle + reach * rng.uniform(-1.0, 1.0) - place[-1]
+            s = np.clip((t - at) / lasts_s, 0.0, 1.0)
+            place += way * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+            rate += way / lasts_s * s**2 * (30.0 - 60.0 * s + 30.0 * s**2)
+            change += way / lasts_s**2 * s * (60.0 - 180.0 * s + 120.0 * s**2)
+            at += lasts_s + rng.uniform(0.0, 0.8)
+    length, turn = path[0], rig.plant.bellows_radius_m * path[1]
+    nodes = np.tile(np.asarray(state_row(rig.plant), dtype=np.float64), (len(t), 1))
+    nodes[:, :4] = np.stack(
+        [length[0] + turn[0], length[0] - turn[0], length[1] + turn[1], length[1] - turn[1]]
+    ).T
+    c = coefficients(rig.plant)
+    for row, wanted in zip(nodes, np.stack([length[2] + turn[2], length[2] - turn[2]]).T, strict=True):
+        # The forces that make these accelerations.
+        free, one, two = (derivative(c, row[:6], *F)[2:4] for F in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+        row[8:10] = np.linalg.solve(np.stack([one - free, two - free], axis=1), wanted - free)
+    whole, sensors = Trajectory(node_s, nodes), Sensors(rig, _Plant(rig, rig.plant), ticks, seed)
+    sensors.take_frames(whole, slice(0, ticks))
+    sensors.take_samples(whole, slice(0, len(sensors.imu.taken_s)))
+    log = log_of(Run(rig, rig.plant, whole, np.zeros((ticks, 2)), rig.pump.tick_s, None, sensors))
+    return replace(log, columns={name: of for name, of in log.columns.items() if not name.startswith("pwm")})
