@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x54090684UL
+#define CALIB_ID 0x6C75D580UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -174,11 +174,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0150379008f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0680584162f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0150378812f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0680584311f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.01740646f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00579439756f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228071362f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228071399f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -193,12 +193,12 @@
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
 #define CALIB_MM_DT_S 0.016386725f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.49511959e-05f /* bias times the same, rad */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.49512032e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145611577f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145611567f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -236,15 +236,15 @@
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.50148654f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000253142265f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.87496379e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.20656897e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.77445144e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000257548556f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.74415109e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00250804354f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000255661929f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.8749647e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.20656443e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.77445235e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000257548585f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.74415163e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00250804378f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000255661958f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.0081933625f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.7475598e-05f /* bias times the same, rad */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.74756016e-05f /* bias times the same, rad */
 #define CALIB_FUSED_PHI_PER_M 0.374154776f /* K_c / lever, rad/m */
 #define CALIB_FUSED_ALONE_PHI_PER_M 5.3032074f /* the same without the IMU, rad/m */
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.6064148f /* the same after a start, rad/m */
