@@ -9,7 +9,7 @@
 
 #include "calib_pipeline.h"
 
-#if CALIB_ID != 0x7E1E24CDUL
+#if CALIB_ID != 0xF74F3D4BUL
 #error "calib: calib_selftest.h is of another rig than calib_constants.h"
 #endif
 #if CALIB_UNDISTORT != 1
