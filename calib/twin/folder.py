@@ -15,6 +15,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -90,15 +91,28 @@ def write_rig_folder(
     with to_be("written", folder):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise BadInputError(f"{shown(folder)}: is there already, expected a new or an empty folder")
-        (folder / "logs").mkdir(parents=True, exist_ok=True)
-        taken = [replace(shot, seed=shot.seed + _PICTURES_SEEDS * seed) for shot in _views(rig.view)]
-        write_pictures(folder / "images", rig.view.camera, taken)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        # All of it or nothing: a part would be taken for a whole rig.
+        with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as place:
+            whole = Path(place) / "rig"
+            names = _write(whole, rig, seed, feedback, progress)
+            if folder.exists():
+                folder.rmdir()
+            whole.rename(folder)
+    return [folder / name for name in names]
+
+
+def _write(
+    folder: Path, rig: SimulatedRig, seed: int, feedback: str, progress: Progress | None
+) -> list[Path]:
+    (folder / "logs").mkdir(parents=True)
+    taken = [replace(shot, seed=shot.seed + _PICTURES_SEEDS * seed) for shot in _views(rig.view)]
+    write_pictures(folder / "images", rig.view.camera, taken)
     written = []
     for index, (name, (scenario, options)) in enumerate(LOGS.items()):
         run = run_scenario(make_scenario(scenario, options), rig, len(LOGS) * seed + index, feedback)
-        path = folder / "logs" / f"{name}.csv"
-        write_atomically(path, log_text(log_of(run, name)))
-        written.append(path)
+        written.append(Path("logs") / f"{name}.csv")
+        write_atomically(folder / written[-1], log_text(log_of(run, name)))
         if progress is not None:
             progress(index + 1, len(LOGS))
     write_atomically(folder / "truth.json", json.dumps(_plain(asdict(rig)), indent=1) + "\n")

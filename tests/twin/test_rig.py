@@ -155,3 +155,14 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="is there already"):
         write_rig_folder(tmp_path / "mine.txt", RIG)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_rig_that_is_cut_off_leaves_nothing(tmp_path: Path) -> None:
+    """A part would be taken for a whole rig, and the folder refused the next time."""
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_rig_folder(tmp_path / "new" / "rig", RIG, progress=stop)
+    assert not list((tmp_path / "new").iterdir())
