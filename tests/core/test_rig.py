@@ -119,6 +119,10 @@ def test_a_rig_and_itself(tmp_path: Path) -> None:
     assert found.changes == () and not found.significant
     assert found.plane is not None and found.plane.largest_mm < 1e-6
     assert found.compared > 20
+    # What a notebook shows of it.
+    words = [line.split() for line in repr(rig).splitlines()]
+    assert ["geometry", "stated"] in words and ["plane", "ok"] in words
+    assert "<td>plane</td><td>ok</td>" in rig._repr_html_()
 
 
 def test_difference_in_standard_deviations_of_both(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -124,8 +124,8 @@ class Header:
     verdict : of the sections that the constants come from.
     """
 
-    text: str
-    literals: Mapping[str, str]
+    text: str = field(repr=False)
+    literals: Mapping[str, str] = field(repr=False)
     digest: str
     verdict: Verdict
 
