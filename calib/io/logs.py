@@ -569,6 +569,8 @@ _BIN_S, _BINS = 0.5, 10
 _UPRIGHT, _LEAST_MPS2 = 0.75, 3.0
 _FELT_RAD, _ANSWERED = 0.03, 0.1
 """2 degrees, RMS: for half a second 0.03 g, of which a gyroscope that works shows more than a tenth."""
+_MOST_BIAS_RADPS = 0.35
+"""20 deg/s, the zero-rate output that the MPU-6050's data sheet allows."""
 _CARRIED_MPS = 0.3
 """What carries a rig without turning it is slower, RMS, and would feel the same as a turn."""
 _STUCK_S, _SHAKEN_RAD = 1.0, 0.1
@@ -841,9 +843,9 @@ def _unmoved(log: Log) -> Finding | None:
     """Where the accelerometer moves and the gyroscope is stuck, or does not answer its turns.
 
     For the latter both angles are averaged over half a second and compared about their straight lines over
-    five seconds, which take a bias out. A sensor that is carried without turning feels its acceleration,
-    whose velocity stays small. Of a sensor that tilts
-    the angle turns about all three axes (`calib.stages.imu.tracks`); far out of the plane it is none.
+    five seconds, which take a bias out; a line that is steeper than a bias is a turn. A sensor that is
+    carried without turning feels its acceleration, whose velocity stays small. Of a sensor that tilts the
+    angle turns about all three axes (`calib.stages.imu.tracks`); far out of the plane it is none.
     """
     tilts = "az_mps2" in log.columns
     if tilts and not all(name in log.columns for name in IMU):
@@ -886,7 +888,11 @@ def _unmoved(log: Log) -> Finding | None:
     felt_rad, turned_rad = angles.std(axis=2).T
     carried_mps = GRAVITY_MPS2 * _BIN_S * np.cumsum(angles[:, 0], axis=1).std(axis=1)
     dead = np.flatnonzero(
-        flat & (felt_rad > _FELT_RAD) & (turned_rad < _ANSWERED * felt_rad) & (carried_mps > _CARRIED_MPS)
+        flat
+        & (felt_rad > _FELT_RAD)
+        & (turned_rad < _ANSWERED * felt_rad)
+        & (carried_mps > _CARRIED_MPS)
+        & (np.abs(slope[:, 1]) < _MOST_BIAS_RADPS)
     )
     if len(dead) == 0:
         return None

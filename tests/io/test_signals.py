@@ -107,6 +107,10 @@ def test_a_gyroscope_that_does_not_answer_is_named() -> None:
     # A slide goes to and fro by 0.2 m/s without turning.
     slid = _log(gz_radps=noise, ax_mps2=G, ay_mps2=0.2 * 2.5 * np.sqrt(2.0) * np.cos(2.5 * t))
     assert slid.signals(*IN_PLANE).findings == ()
+    # At 200 deg/s a lever of half a metre is felt by 0.6 g, and the rate stays the same.
+    force = G * np.exp(3.5j * t) - 0.5 * 3.5**2
+    turning = _log(gz_radps=noise - 3.5, ax_mps2=force.real, ay_mps2=force.imag)
+    assert turning.signals(*IN_PLANE).findings == ()
     assert log.signals(*IN_PLANE).findings == ()
 
 
