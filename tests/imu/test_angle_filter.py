@@ -779,6 +779,22 @@ def test_a_sound_log_does_not_contradict_itself(reference: bool, lever_m: float)
         assert contradictions(pieces, tune(pieces, DATA_SHEET)) == []
 
 
+@pytest.mark.parametrize("way", ["cart", "walk"])
+def test_what_pushes_the_sensor_contradicts_nothing(way: str) -> None:
+    """A cart that brakes by 0.3 g for 3 s, and an arm that swings partly in step with its walk."""
+    t, rng = 0.02 * np.arange(3000), np.random.default_rng(0)
+    if way == "cart":
+        phi = 0.15 * np.sin(0.8 * t) + 0.1 * np.sin(1.7 * t)
+        across, along = np.where(t % 20.0 < 9.0, 0.1, np.where(t % 20.0 < 12.0, -0.3, 0.0)), 0.0
+    else:
+        phi = 0.44 * np.sin(6.0 * t) + 0.1 * np.sin(1.1 * t)
+        across, along = 0.1 * np.sin(6.0 * t + 1.0) - 0.8 * np.sin(6.0 * t), 0.25 * np.sin(12.0 * t)
+    felt = np.angle((1.0 + along + 1j * across) * np.exp(1j * phi)) + 0.003 * rng.normal(size=3000)
+    rate = np.gradient(phi, t) + 0.002 * rng.normal(size=3000)
+    pieces = [Piece("log.csv", t, felt, rate, phi)]
+    assert contradictions(pieces, tune(pieces, DATA_SHEET)) == []
+
+
 def test_the_noise_of_a_reference_contradicts_nothing() -> None:
     """As of a marker that jumps by two pixels in a swing of five degrees."""
     piece = _piece(3, True)

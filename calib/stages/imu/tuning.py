@@ -903,6 +903,7 @@ _TIMES_THE_SENSOR = 10.0
 _MOST_TURNED_RAD = math.radians(5.0)
 _MEAN_S, _FEWEST_MEANS = 2.0, 5
 _TURNED_SLOWLY_RAD = math.radians(3.0)
+_ALIKE_SLOWLY = 0.5
 
 
 def _level(t_s: FloatArray, values: FloatArray) -> FloatArray:
@@ -965,10 +966,34 @@ def _slowly(t_s: FloatArray, own_rad: FloatArray, seen_rad: FloatArray) -> str:
     own, seen = own - own.mean(), seen - seen.mean()
     if max(float(own.std()), float(seen.std())) < _TURNED_SLOWLY_RAD:
         return ""
-    scale = float(own @ seen) / max(float(own @ own), 1e-12)
+    # A cart that brakes is felt and does not turn. Errors of either angle flatten the regression on it, so
+    # that the scale lies between both regressions; angles that hardly resemble each other tell none.
+    both = float(own @ seen) / max(float(np.linalg.norm(own) * np.linalg.norm(seen)), 1e-12)
+    if abs(both) < _ALIKE_SLOWLY:
+        return ""
+    ratio = float(seen.std() / own.std())
+    scale = float(np.clip(1.0, *sorted((both * ratio, ratio / both))))
     if abs(scale - 1.0) <= _MOST_SCALE or abs(scale - 1.0) * float(own.std()) <= _TURNS_RAD:
         return ""
     return f"the angle turns {scale:.3g} times as far as the accelerometer says"
+
+
+def _rate_error(piece: Piece, own: Smoothed) -> float:
+    """Density of the rate's error [rad/s/sqrt(Hz)] by the log itself, or by its reference where that is less.
+
+    A log that is pushed for seconds blames its rate for what the accelerometer feels. Means over a span of an
+    angle that walks by N differ from each other by N sqrt(2 span / 3).
+    """
+    if piece.reference_rad is None:
+        return own.gyro_noise
+    known = np.isfinite(piece.reference_rad)
+    span = ((piece.t_s - piece.t_s[0]) / _MEAN_S).astype(np.int64)[known]
+    off = np.unwrap((piece.reference_rad - integral(piece.t_s, piece.rate_radps))[known])
+    count = np.bincount(span)
+    if int((count > 0).sum()) < _FEWEST_MEANS:
+        return own.gyro_noise
+    steps = np.diff(np.bincount(span, off)[count > 0] / count[count > 0])
+    return min(own.gyro_noise, float(steps.std()) / math.sqrt(2.0 * _MEAN_S / 3.0))
 
 
 def _late(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> float:
@@ -1028,9 +1053,12 @@ def _later(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> 
     together = np.bincount(of, np.where(kept, X[:, 0] * left, 0.0))
     sigma = math.sqrt(float(together @ together)) / max(size, 1e-300)
     late = float(fit[0])
-    if abs(late) - _SURE * sigma <= _LATER_S:
+    off_rad = abs(late) * math.sqrt(size / int(kept.sum()))
+    # Accelerations of the sensor's own that are partly in step with its turns leave more than a lag does.
+    rest_rad = float(left[kept].std())
+    if abs(late) - _SURE * sigma <= _LATER_S or rest_rad > _LEFT_OF_REST * math.hypot(off_rad, rest_rad):
         return 0.0, 0.0
-    return late, abs(late) * math.sqrt(size / int(kept.sum()))
+    return late, off_rad
 
 
 def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
@@ -1061,13 +1089,16 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
                 when = "later" if late > 0.0 else "earlier"
                 found(
                     piece.source,
-                    f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's",
+                    f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's, or "
+                    "it is pushed in step with its turns",
                 )
-            elif own.gyro_noise > max(_TIMES_THE_SENSOR * result.noise.gyro, _MOST_RATE_ERROR):
+            elif (errs := _rate_error(piece, own)) > max(
+                _TIMES_THE_SENSOR * result.noise.gyro, _MOST_RATE_ERROR
+            ):
                 found(
                     piece.source,
                     "rate and accelerometer contradict each other: the rate errs by "
-                    f"{math.degrees(own.gyro_noise):.2g} deg/s/sqrt(Hz), the sensor by "
+                    f"{math.degrees(errs):.2g} deg/s/sqrt(Hz), the sensor by "
                     f"{math.degrees(result.noise.gyro):.2g}",
                     "poor",
                 )
@@ -1081,7 +1112,8 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
                     found(
                         piece.source,
                         f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's, "
-                        f"which is {math.degrees(off_rad):.2g} deg (RMS) in these turns",
+                        f"which is {math.degrees(off_rad):.2g} deg (RMS) in these turns, or it is pushed "
+                        "in step with them",
                     )
     offsets = [
         (piece.source, offset)
@@ -1252,7 +1284,8 @@ def _of_tuning(result: Tuning, logs: Sequence[TuneLog], tilted: bool) -> Iterato
                 "remark",
                 "The settled Kalman filter, riccati, takes longer than these logs to learn the bias.",
             )
-    worst = max((s.gyro_noise for s in result.smoothed if s is not None), default=0.0)
+    both = zip(pieces, result.smoothed, strict=True)
+    worst = max((_rate_error(piece, own) for piece, own in both if own is not None), default=0.0)
     if worst > _TILTED * result.noise.gyro and not tilted:
         yield Finding(
             "remark",
