@@ -972,7 +972,8 @@ def _slowly(t_s: FloatArray, own_rad: FloatArray, seen_rad: FloatArray) -> str:
     if abs(both) < _ALIKE_SLOWLY:
         return ""
     ratio = float(seen.std() / own.std())
-    scale = float(np.clip(1.0, *sorted((both * ratio, ratio / both))))
+    least, most = sorted((both * ratio, ratio / both))
+    scale = min(max(1.0, least), most)
     if abs(scale - 1.0) <= _MOST_SCALE or abs(scale - 1.0) * float(own.std()) <= _TURNS_RAD:
         return ""
     return f"the angle turns {scale:.3g} times as far as the accelerometer says"
