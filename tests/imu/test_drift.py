@@ -12,9 +12,11 @@ import pytest
 from armlogs import swung
 from scipy.signal import lfilter
 
+from calib.io.logs import Log
 from calib.solve.clock import Part
 from calib.stages.imu.drift import allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, advance, filter_log
+from calib.stages.imu.read import Reading, tune_log
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.tracks import Tuned, tracks_of
 from calib.stages.imu.tuning import smooth_log
@@ -104,6 +106,17 @@ def test_a_truth_that_comes_late_is_moved() -> None:
     assert math.radians(accel.rmse_deg) == pytest.approx(0.02 / 9.81, rel=0.1)
     assert abs(accel.lag_ms) < 0.5
     assert "14.8 ms later" in result.remarks[0]
+
+
+@pytest.mark.parametrize("late_s", [0.0148, 0.0])
+def test_tuning_moves_a_truth_that_comes_late(late_s: float) -> None:
+    """At 1 kHz, with a bias of 5 deg/s, which the ends of a stretch show."""
+    t = 0.001 * np.arange(40_000)
+    phi, rate = 0.5 * np.sin(0.6 * (t - late_s)), 0.3 * np.cos(0.6 * t)
+    columns = {"ax_mps2": 9.8 * np.cos(phi), "ay_mps2": 9.8 * np.sin(phi), "gz_radps": 0.09 - rate}
+    columns["gz_radps"] = columns["gz_radps"] + 0.004 * np.random.default_rng(0).normal(size=len(t))
+    log = Log("log.csv", t, columns | {"true_phi_rad": phi}, np.arange(len(t)))
+    assert tune_log(log, Reading(False, "truth")).lag_s == pytest.approx(late_s, abs=1e-3)
 
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]

@@ -164,9 +164,10 @@ def allan_at(stretches: Sequence[FloatArray], period_s: float, tau_s: float) -> 
 
 
 def _quick(y: FloatArray, period_s: float) -> FloatArray:
-    """What is faster than some seconds."""
+    """What is faster than some seconds, without ends where the mean does not take a bias out."""
     size = min(max(round(_SLOW_S / period_s), 3), len(y))
-    return np.asarray(y - uniform_filter1d(y, size, mode="nearest"))
+    end = min(size // 2, len(y) // 8)
+    return np.asarray(y - uniform_filter1d(y, size, mode="nearest"))[end : len(y) - end]
 
 
 def lag_s(
@@ -195,7 +196,9 @@ def lag_s(
         n = len(t)
         if n < 4 * M:
             continue
-        quick_e, quick_t = _quick(e, period_s), _quick(t, period_s)[M : n - M]
+        quick_e, quick_t = _quick(e, period_s), _quick(t, period_s)
+        n = len(quick_t)
+        quick_t = quick_t[M : n - M]
         theirs += float(quick_t @ quick_t)
         for i, lag in enumerate(lags.tolist()):
             moved = quick_e[M + lag : n - M + lag]
@@ -210,6 +213,20 @@ def lag_s(
     bend = c[i - 1] - 2.0 * c[i] + c[i + 1]
     fraction = 0.5 * (c[i - 1] - c[i + 1]) / bend if bend < 0.0 else 0.0
     return float((lags[i] + fraction) * period_s)
+
+
+def truth_late_s(
+    turned: Sequence[FloatArray], truth: Sequence[FloatArray], period_s: float, turned_late_s: float = 0.0
+) -> float:
+    """How much later [s] a truth comes than the gyroscope turned; 0 where that is not clear or negligible.
+
+    Parameters
+    ----------
+    turned, truth : angles (n_i,) [rad] of each part, NaN where not known.
+    turned_late_s : by how much the integrated angles come late themselves.
+    """
+    late_s = turned_late_s - lag_s(*_both_known(turned, truth), period_s, least=_SURE_CORRELATION)
+    return late_s if abs(late_s) > _LEAST_LATE * period_s else 0.0
 
 
 # ----------------------------------------------------------------------
@@ -383,12 +400,9 @@ def analyse_drift(
     truth, late_s = None, 0.0
     if len(log.true_t_s) >= 2:
         truth = on_grid(log.true_t_s, log.true_phi_rad, parts, period_s)
-        turned = _both_known(by_name["gyroscope alone"], truth)
-        late_s = -0.5 * period_s - lag_s(*turned, period_s, least=_SURE_CORRELATION)
-        if abs(late_s) > _LEAST_LATE * period_s:
+        late_s = truth_late_s(by_name["gyroscope alone"], truth, period_s, -0.5 * period_s)
+        if late_s:
             truth = on_grid(log.true_t_s - late_s, log.true_phi_rad, parts, period_s)
-        else:
-            late_s = 0.0
         stretches = [(k, _settled(0, len(part.values), period_s)) for k, part in enumerate(parts)]
     else:
         stretches = [
@@ -473,8 +487,9 @@ def _remarks(log: Readings, sampling: Sampling, truth_late_s: float) -> Iterator
     for finding in sampling_findings(sampling, log.axes, log.source):
         yield finding.text
     if truth_late_s:
+        when = "later" if truth_late_s > 0.0 else "earlier"
         yield (
-            f"{log.source}: true_phi_rad comes {1e3 * truth_late_s:.1f} ms later than the gyroscope "
+            f"{log.source}: true_phi_rad comes {1e3 * abs(truth_late_s):.1f} ms {when} than the gyroscope "
             "turns; it is moved by that, and lags are against the gyroscope"
         )
     upright = _upright(log)

@@ -23,6 +23,7 @@ from calib.io.columns import ACCEL, GYRO
 from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
 from calib.solve.clock import Part
 from calib.solve.delay import delay_of
+from calib.stages.imu.drift import truth_late_s
 from calib.stages.imu.sampling import (
     AXES,
     MOST_GYRO_RADPS,
@@ -244,7 +245,10 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
     references: tuple[FloatArray | None, ...] = (None,) * len(kept)
     rates = [rate_of(part, read.axes, how.tilted) for part in kept]
     if named:
-        if named != "truth":
+        if named == "truth":
+            turned = [integral(part.t_s, rate) for part, rate in zip(kept, rates, strict=True)]
+            lag = truth_late_s(turned, on_grid(late_t_s, phi, kept, period), period)
+        else:
             lag = _lag(late_t_s, phi, kept, rates, read.axes, period)
         references = on_grid(late_t_s - lag, phi, kept, period)
     for part, rate, reference in zip(kept, rates, references, strict=True):
