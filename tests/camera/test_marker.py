@@ -154,6 +154,22 @@ def test_a_hose_before_a_part_makes_it_lost_or_unsure(radius_px: float) -> None:
     assert len(wrong) >= 10 and sum(wrong) <= 2
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_light_that_changes_over_the_disc_moves_no_centre(slope: float) -> None:
+    """On one edge three tenths more than in the middle, on the other as much less."""
+    zoom, centre, radius_px, rng = 4, np.array([60.3, 59.8]), 16.0, np.random.default_rng(0)
+    u, v = np.meshgrid(*2 * [(np.arange(120 * zoom) + 0.5) / zoom - 0.5])
+    across, down = u - centre[0], v - centre[1]
+    inside = (np.hypot(across, down) < radius_px)[..., None]
+    lit = (1.0 + slope / radius_px * (0.8 * across - 0.6 * down))[..., None]
+    fine = np.where(inside, lit * [0.02, 0.15, 0.5], 0.1)
+    light = cv2.resize(cv2.GaussianBlur(fine, (0, 0), 0.7 * zoom), (120, 120), interpolation=cv2.INTER_AREA)
+    frame = 255 * light ** (1 / 2.2) + rng.standard_normal(light.shape)
+    one = Tracker(parse_colour("orange")).follow(np.clip(np.rint(frame), 0, 255).astype(np.uint8))
+    assert one is not None
+    assert one.centre_px == pytest.approx(centre, abs=0.06)
+
+
 def test_the_scatter_of_a_path_is_that_of_its_noise_however_even_frames_are() -> None:
     """Even frames, a file of variable rate, and even frames whose times of arrival are not."""
     rng, even = np.random.default_rng(0), np.arange(400) / 60

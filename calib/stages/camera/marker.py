@@ -6,9 +6,9 @@ each pixel is a mixture of marker and background,
     p = a M + (1 - a) B,    a = (p - B) . (M - B) / |M - B|^2,
 
 with M the colour inside and B the colour outside of that ray, so that light, shadow and what lies beside
-the disc differ as they may. The edge is where a = 1/2, by the area under a about that place, and an ellipse
-is fitted to the edges, less those that do not belong to it. Blur by motion during the exposure is symmetric
-about its middle, and so is the edge.
+the disc differ as they may; M goes on to the edge as the light over the disc does. The edge is where a = 1/2,
+by the area under a about that place, and an ellipse is fitted to the edges, less those that do not belong to
+it. Blur by motion during the exposure is symmetric about its middle, and so is the edge.
 What is no ellipse, too small, or not told apart from another one is lost rather than guessed.
 
 The ellipse's centre is not the image of the disc's centre; `disc_centre` corrects it where camera and plane
@@ -65,6 +65,9 @@ _SURELY_PX = 0.15
 """Distance within which an edge always belongs."""
 _ROUGH_SHARE = 0.06
 """Scatter of the edges over the radius above which a blob is no disc."""
+_LIT = 0.8
+"""Share of the radius within which the light's slope is read; a blur takes alike from both sides."""
+_LIGHT_WAVES = np.exp(-1j * np.outer(_ANGLES, np.arange(1, 7)))
 _LIGHT = (np.arange(256) / 255.0) ** 2.2
 """Light by grey level: mixtures are mixtures of light, and cameras store about its root."""
 _ORDERS = np.arange(3, 13)
@@ -255,6 +258,14 @@ def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray
     M = colours[:, within].mean(axis=1)
     # Light may differ over the disc, and noise is large in few pixels: half of its own, half of all.
     M = 0.5 * (M + M.mean(axis=0))
+    # From there to the edge M changes as the plane does that fits the light best, a pixel for each area of
+    # it, all channels alike. A glint, a hose and a codec raise the next waves too, whose part is taken off.
+    lit, whole = r < _LIT * radius, M.mean(axis=0)
+    light = (colours[:, lit] * r[lit, None] ** 2).mean(axis=1) @ whole / (r[lit] ** 3).mean()
+    first, *others = np.abs(light @ _LIGHT_WAVES) ** 2
+    slope = max(1.0 - sum(others) / max(first, 1e-12), 0.0) * 2.0 / _RAYS * light @ _TOWARDS
+    further = (radius - 0.5 * r[within].mean()) * _TOWARDS @ slope
+    M += np.outer(further, whole) / max(float(whole @ whole), 1e-9)
     beyond = r > 1.25 * radius + 1.0
     B = np.median(colours[:, beyond], axis=1)
     across = M - B
