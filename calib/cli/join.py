@@ -56,9 +56,11 @@ def join(
     given = 0.0 if same_clock else offset
     remarks: list[str] = []
     marker = read_log(camera, stated, remarks, known.picture_px)
-    log, clocks, outside = joined(marker, read_log(board, stated, remarks), known, shown(rig), given)
+    felt = read_log(board, stated, remarks)
+    # Before what may be refused for a column that was not read.
     for remark in remarks:
         narrate(remark)
+    log, clocks, outside = joined(marker, felt, known, shown(rig), given)
     write_log(output, log, LOG)
     told: dict[str, Any] = {"log": shown(output), "rows": len(log), "outside": outside}
     lines = [f"{len(log)} rows written to {shown(output)}: t_s, {', '.join(log.columns)}"]

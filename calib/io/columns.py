@@ -109,7 +109,7 @@ _SPELLED = {
     "us": "us µs μs usec micros microsecond microseconds", "ns": "ns nanos nanosecond nanoseconds",
     "m/s2": "m/s2 m/s^2 m/s² m/s/s ms2 mps2 m_s2 ms-2 ms^-2", "g": "g gs gee", "mg": "mg",
     "cm/s2": "cm/s2 cm/s^2 cm/s² cmps2 gal",
-    "rad/s": "rad/s rads radps rad_s rad/sec", "deg/s": "deg/s °/s dps degps degs deg_s deg/sec",
+    "rad/s": "rad/s rads radps rad_s rad/sec", "deg/s": "deg/s °/s dps degps degs deg_s deg/sec grad/s",
     "mdeg/s": "mdps mdeg/s", "rad": "rad", "deg": "deg degree degrees °", "px": "px pixel pixels pix",
     "counts": "raw lsb count counts adc", "percent": "% percent",
     "kPa": "kpa", "Pa": "pa pascal", "bar": "bar", "psi": "psi", "m": "m", "mm": "mm", "cm": "cm",

@@ -335,6 +335,7 @@ def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     assert "0.010000,5,6,,," in (tmp_path / "moved.csv").read_text()
     ended = calib("join", "track.csv", "board.csv", "-o", "other.csv", cwd=tmp_path)
     assert ended.code == 3 and "do not tell one offset" in ended.err
+    assert "track.csv: not read: sigma_px" in ended.err
     assert not (tmp_path / "other.csv").exists()
     text = "time,seconds_elapsed,z,y,x\n" + "".join(
         f"{10**18},{0.01 * k:.2f},0,9.8,{k % 3}\n" for k in range(30)

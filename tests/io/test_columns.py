@@ -74,6 +74,7 @@ def _written(
         ("Uhrzeit", ("t_s", "")),
         ("Beschleunigung X (m/s²)", ("ax_mps2", "m/s2")),
         ("Drehrate z (°/s)", ("gz_radps", "deg/s")),
+        ("Gyro z (Grad/s)", ("gz_radps", "deg/s")),
         ("accélération y [g]", ("ay_mps2", "g")),
         ("velocità angolare z", ("gz_radps", "")),
         ("Magnetometer X (uT)", None),
