@@ -106,6 +106,8 @@ def drift_log(log: Log) -> Readings:
 _TUNELOGS_FEWEST = 20
 _SHORTEST_S = 1.0
 """Pieces of less are passed over."""
+_BRIDGED_S, _LONG_ENOUGH_S = 0.2, 10.0
+"""Gaps up to which rates stay near a straight line, in a hand too; parts that leave some seconds to judge."""
 _MOST_AT_LIMIT = 1e-3
 _APART = 0.03
 """Share of the rate by which -gz may differ from the up vector's."""
@@ -209,6 +211,18 @@ def _lag(
     return delay_of(late_t_s, np.unwrap(late_rad), t, own, turned)
 
 
+def _without_gaps(parts: Sequence[Part], period_s: float) -> tuple[Part, ...]:
+    """Parts cut at gaps that no straight line bridges; as they are where little would be left to judge by."""
+    out = []
+    for part in parts:
+        after = np.flatnonzero(np.diff(part.places) * period_s > _BRIDGED_S) + 1
+        for rows, places in zip(np.split(part.rows, after), np.split(part.places, after), strict=True):
+            a, b = int(places[0]), int(places[-1]) + 1
+            out.append(Part(part.t_s[a:b], part.values[a:b], rows, places - a))
+    long = sum(len(part.t_s) for part in out if len(part.t_s) * period_s >= _LONG_ENOUGH_S)
+    return tuple(out) if 2 * long >= sum(len(part.t_s) for part in parts) else tuple(parts)
+
+
 def tune_log(log: Log, how: Reading) -> TuneLog:
     """A log's angles and rates.
 
@@ -232,7 +246,12 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
         for one in limit_findings(sampling, read.axes, _MOST_AT_LIMIT)
         if one.text[:2] in ("gz", "ax", "ay")
     )
-    kept = [part for part in parts if len(part.values) * period >= _SHORTEST_S]
+    whole = _without_gaps(parts, period)
+    if len(whole) > len(parts):
+        said.append(
+            f"{log.source}: judged in {len(whole)} parts, apart by gaps of more than {_BRIDGED_S:g} s"
+        )
+    kept = [part for part in whole if len(part.values) * period >= _SHORTEST_S]
     if not kept:
         raise BadInputError(
             f"{log.source}: has {sampling.samples} IMU samples over {sampling.duration_s:.3g} s, expected "

@@ -817,8 +817,9 @@ def tune(pieces: Sequence[Piece], sensor: Noise) -> Tuning:
             target = None
         elif own is not None and _astray(own, sensor):
             reasons.append(
-                f"{piece.source}: the rate errs by {math.degrees(own.gyro_noise):.2g} deg/s/sqrt(Hz), so "
-                "that it is not the rate of the angle, and the log cannot judge itself."
+                f"{piece.source}: rate and accelerometer differ by {math.degrees(own.gyro_noise):.2g} "
+                "deg/s/sqrt(Hz). The rate is not that of the angle, or the sensor is pushed for seconds; the "
+                "log cannot judge itself, an outside angle (--reference) could judge."
             )
             target = None
         offsets.append(offset)
@@ -1098,8 +1099,8 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
             ):
                 found(
                     piece.source,
-                    "rate and accelerometer contradict each other: the rate errs by "
-                    f"{math.degrees(errs):.2g} deg/s/sqrt(Hz), the sensor by "
+                    "rate and accelerometer contradict each other: the rate, unless the sensor is pushed for "
+                    f"seconds, errs by {math.degrees(errs):.2g} deg/s/sqrt(Hz), the sensor by "
                     f"{math.degrees(result.noise.gyro):.2g}",
                     "poor",
                 )
