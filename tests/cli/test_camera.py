@@ -209,6 +209,27 @@ def test_the_shipped_plane(calib, project_root, rig) -> None:
     assert set(whole["provenance"]["inputs"]["plane"]) == {"board.yaml", "camera", "plane01.png"}
 
 
+def test_the_plane_of_a_video_is_that_of_its_picture(calib, folder, rig) -> None:
+    """A hand covers the board before and after."""
+    assert calib("extrinsics", folder, "--rig", rig).code == 0
+    of_picture = yaml.safe_load(rig.read_text())["plane"]
+    still = cv2.imread(str(folder / "plane01.png"))
+    (folder / "plane01.png").unlink()
+    video = cv2.VideoWriter(
+        str(folder / "rest.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 30.0, still.shape[1::-1]
+    )
+    for frame in (0 * still, still, still, 0 * still):
+        video.write(frame)
+    video.release()
+    ended = calib("extrinsics", folder, "--rig", rig)
+    assert ended.code == 3 and "holds no pictures, but rest.avi; give that recording itself" in ended.sentence
+    assert calib("extrinsics", folder / "rest.avi", "--rig", rig).code == 0
+    whole = yaml.safe_load(rig.read_text())
+    np.testing.assert_allclose(whole["plane"]["A_px_per_m"], of_picture["A_px_per_m"], rtol=1e-5, atol=1e-4)
+    assert whole["plane"]["pictures"] == 1
+    assert set(whole["provenance"]["inputs"]["plane"]) == {"board.yaml", "camera", "rest.avi"}
+
+
 def test_a_camera_has_to_be_there_first(calib, folder, tmp_path) -> None:
     rig = tmp_path / "rig.yaml"
     ended = calib("extrinsics", folder, "--rig", rig)

@@ -895,10 +895,7 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
         raise UsageError("--topic: goes with a bag")
     folders = [source for source in sources if not is_recording(source)]
     for folder in folders:
-        inside = sorted(folder.iterdir()) if folder.is_dir() and not holds_pictures(folder) else []
-        if any(is_recording(path) for path in inside):
-            name = next(shown(path.name) for path in inside if is_recording(path))
-            raise BadInputError(f"{shown(folder)}: holds no pictures, but {name}; give that recording itself")
+        refuse_recordings(folder)
     paths = list_pictures(folders) if folders else []
     frames = [picture for one in recordings for picture in one.pictures]
     file, hashes = board_of(sources)
@@ -960,6 +957,29 @@ def _of_recording(
         f"board in {len(own)}, used {len(kept)} that say most of the camera"
     )
     return tuple(view for view in views if view.name not in names or view.name in kept), remark
+
+
+def refuse_recordings(folder: Path) -> None:
+    """Raise `BadInputError` for a folder that holds recordings and no pictures."""
+    inside = sorted(folder.iterdir()) if folder.is_dir() and not holds_pictures(folder) else []
+    for path in filter(is_recording, inside):
+        raise BadInputError(
+            f"{shown(folder)}: holds no pictures, but {shown(path.name)}; give that recording itself"
+        )
+
+
+def of_still(frames: Frames, search: BoardSearch) -> BoardSearch:
+    """What a recording of a board that rests shows: one view, the middle one of those with the board.
+
+    A hand that lays the board, or takes it away, is in the first frames or in the last.
+    """
+    names = {picture.name for picture in frames.pictures}
+    return replace(
+        search,
+        views=search.views[len(search.views) // 2 :][:1],
+        left_out=tuple(one for one in search.left_out if one.name not in names),
+        hashes={frames.source: frames.sha256},
+    )
 
 
 def meant_folder(source: Path, inside: str, remarks: list[str]) -> Path:

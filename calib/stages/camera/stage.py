@@ -232,10 +232,19 @@ def _read_plane(
 ]:
     from calib.core.files import shown
     from calib.core.verdict import Finding
+    from calib.io.frames import is_recording, read_frames
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
     from calib.stages.camera.plane import BoardPlace, settle_orientation, world_points_m
-    from calib.stages.camera.read import BOARD_FILE, another_square, board_of, find_boards, meant_folder
+    from calib.stages.camera.read import (
+        BOARD_FILE,
+        another_square,
+        board_of,
+        find_boards,
+        meant_folder,
+        of_still,
+        refuse_recordings,
+    )
 
     del options
     assert rig.camera is not None
@@ -243,7 +252,9 @@ def _read_plane(
     source = meant_folder(files.paths[0] if files.paths else Path("images/plane"), "images/plane", remarks)
     for remark in remarks:
         files.narrate(remark)
-    pictures = list_pictures([source])
+    refuse_recordings(source)
+    recording = read_frames(source) if is_recording(source) else None
+    pictures = list_pictures([source]) if recording is None else []
     stated, board_hash = board_of([source])
     folder = source if source.is_dir() else source.parent
     board_file = shown(folder / BOARD_FILE)
@@ -261,7 +272,10 @@ def _read_plane(
             progress,
             rig.camera.optics.image_size_px,
             stated.dictionary,
+            () if recording is None else recording.pictures,
         )
+    if recording is not None:
+        search = of_still(recording, search)
     world_m = world_points_m(search.board, stated.first_corner_m, stated.angle_rad)
     views, orientation, doubts = [], [], list[Finding]()
     if other := another_square(folder, stated):
@@ -368,8 +382,9 @@ extrinsics = Stage(
     """,
     _read_plane,
     _solve_plane,
-    sources="Folder with pictures of the board lying in the plane, and with a board.yaml that says where: "
-    "corners, square_m, first_corner_m: [x, y], angle_rad. [default: images/plane]",
+    sources="Folder with pictures of the board lying in the plane, or a video of it at rest, and beside them "
+    "a board.yaml that says where: corners, square_m, first_corner_m: [x, y], angle_rad. "
+    "[default: images/plane]",
     several=False,
     optional=True,
     writes=("plane",),
