@@ -721,12 +721,12 @@ def test_a_swing_that_begins_with_a_jerk_along_the_head_contradicts_nothing(seed
 
 
 def test_gaps_in_quick_turns_part_a_log_that_keeps_long_parts() -> None:
-    """A hand turns by half a radian in a gap of 0.4 s, which no filter is to be judged by."""
+    """A hand turns by half a radian in a gap of 0.6 s, which no filter is to be judged by."""
     t, rng = 0.01 * np.arange(6000), np.random.default_rng(0)
     phi, rate = 0.8 * np.sin(4.0 * t), 3.2 * np.cos(4.0 * t) + 0.003 * rng.normal(size=6000)
     columns = {"ax_mps2": 9.8 * np.cos(phi), "ay_mps2": 9.8 * np.sin(phi), "gz_radps": -rate}
     for every_s, pieces in ((20.0, 3), (4.0, 1)):
-        kept = t % every_s < every_s - 0.4
+        kept = t % every_s < every_s - 0.6
         log = Log("log.csv", t[kept], {k: v[kept] for k, v in columns.items()}, np.arange(int(kept.sum())))
         found = tune_log(log, Reading(False, "none"))
         assert len(found.pieces) == pieces

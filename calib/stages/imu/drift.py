@@ -28,6 +28,7 @@ from calib.stages.imu.sampling import (
     sampled,
     sampling_findings,
     sensor_findings,
+    without_gaps,
 )
 from calib.stages.imu.section import Drift, DriftGains, DriftMethod, DriftOfLog, DriftSlopes
 from calib.stages.imu.tracks import Track, Tuned, on_grid, tracks_of
@@ -381,6 +382,7 @@ def analyse_drift(
     """
     sampling, every = regular_parts(log)
     period_s = sampling.period_s
+    every = without_gaps(every, period_s)
     parts = tuple(part for part in every if len(part.values) * period_s >= _SHORTEST_S)
     if not parts:
         longest = max(len(part.values) for part in every) * period_s

@@ -202,7 +202,8 @@ _TURNED_G = 0.005
 """Rest: readings this near to their means, and a mean force that has moved by no more since rest began."""
 _REST_RADPS = 0.0015
 """Standard deviation of the mean rate at rest as a bias; rotations show from 0.0025 rad/s on."""
-_GAP_S = 0.5
+GAP_S = 0.5
+"""A gap after which a filter starts anew, here and on the board."""
 _CUT_MPS, _FORGOTTEN_S = 12.0, 10.0
 """A step beyond which, and a velocity cut from V lately by which, the filter starts anew."""
 
@@ -257,7 +258,7 @@ def _run_three(
     for k in range(len(t)):
         dt = t[k] - t[max(k - 1, 0)]
         far = cut[0] * cut[0] + cut[1] * cut[1] + cut[2] * cut[2] > (_CUT_MPS / GRAVITY_MPS2) ** 2
-        if k == 0 or dt > _GAP_S or far:
+        if k == 0 or dt > GAP_S or far:
             begun, size, still = t[k], 0.0, 0.0
             P[0], P[1], P[3] = start[0], 0.0, start[3]
             for i in range(3):

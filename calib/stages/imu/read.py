@@ -24,6 +24,7 @@ from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
 from calib.solve.clock import Part
 from calib.solve.delay import delay_of
 from calib.stages.imu.drift import truth_late_s
+from calib.stages.imu.levelling import GAP_S
 from calib.stages.imu.sampling import (
     AXES,
     MOST_GYRO_RADPS,
@@ -32,6 +33,7 @@ from calib.stages.imu.sampling import (
     quiet_spread,
     regular_parts,
     sampling_findings,
+    without_gaps,
 )
 from calib.stages.imu.tracks import angle_of, on_grid, rate_of
 from calib.stages.imu.tuning import DATA_SHEET, SHORTEST_S, Noise, Piece, TuneLog, smooth_log
@@ -106,8 +108,6 @@ def drift_log(log: Log) -> Readings:
 _TUNELOGS_FEWEST = 20
 _SHORTEST_S = 1.0
 """Pieces of less are passed over."""
-_BRIDGED_S, _LONG_ENOUGH_S = 0.2, 10.0
-"""Gaps up to which rates stay near a straight line, in a hand too; parts that leave some seconds to judge."""
 _MOST_AT_LIMIT = 1e-3
 _APART = 0.03
 """Share of the rate by which -gz may differ from the up vector's."""
@@ -211,18 +211,6 @@ def _lag(
     return delay_of(late_t_s, np.unwrap(late_rad), t, own, turned)
 
 
-def _without_gaps(parts: Sequence[Part], period_s: float) -> tuple[Part, ...]:
-    """Parts cut at gaps that no straight line bridges; as they are where little would be left to judge by."""
-    out = []
-    for part in parts:
-        after = np.flatnonzero(np.diff(part.places) * period_s > _BRIDGED_S) + 1
-        for rows, places in zip(np.split(part.rows, after), np.split(part.places, after), strict=True):
-            a, b = int(places[0]), int(places[-1]) + 1
-            out.append(Part(part.t_s[a:b], part.values[a:b], rows, places - a))
-    long = sum(len(part.t_s) for part in out if len(part.t_s) * period_s >= _LONG_ENOUGH_S)
-    return tuple(out) if 2 * long >= sum(len(part.t_s) for part in parts) else tuple(parts)
-
-
 def tune_log(log: Log, how: Reading) -> TuneLog:
     """A log's angles and rates.
 
@@ -246,11 +234,9 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
         for one in limit_findings(sampling, read.axes, _MOST_AT_LIMIT)
         if one.text[:2] in ("gz", "ax", "ay")
     )
-    whole = _without_gaps(parts, period)
+    whole = without_gaps(parts, period)
     if len(whole) > len(parts):
-        said.append(
-            f"{log.source}: judged in {len(whole)} parts, apart by gaps of more than {_BRIDGED_S:g} s"
-        )
+        said.append(f"{log.source}: judged in {len(whole)} parts, apart by gaps of more than {GAP_S:g} s")
     kept = [part for part in whole if len(part.values) * period >= _SHORTEST_S]
     if not kept:
         raise BadInputError(

@@ -14,6 +14,7 @@ from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.io.logs import clipped
 from calib.solve.clock import SPLIT_S, Gap, Part, time_axis
+from calib.stages.imu.levelling import GAP_S
 
 # ----------------------------------------------------------------------
 # How a log was sampled: rate, jitter, gaps, repeated rows and stamps, steps, readings at their limit.
@@ -246,6 +247,22 @@ def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
         ),
     )
     return sampling, parts
+
+
+_LONG_ENOUGH_S = 10.0
+"""A part that leaves some seconds to judge a filter by."""
+
+
+def without_gaps(parts: Sequence[Part], period_s: float) -> tuple[Part, ...]:
+    """Parts cut where filters start anew; as they are where parts to judge by would be less than half."""
+    out = []
+    for part in parts:
+        after = np.flatnonzero(np.diff(part.places) * period_s > GAP_S) + 1
+        for rows, places in zip(np.split(part.rows, after), np.split(part.places, after), strict=True):
+            a, b = int(places[0]), int(places[-1]) + 1
+            out.append(Part(part.t_s[a:b], part.values[a:b], rows, places - a))
+    long = sum(len(part.t_s) for part in out if len(part.t_s) * period_s >= _LONG_ENOUGH_S)
+    return tuple(out) if 2 * long >= sum(len(part.t_s) for part in parts) else tuple(parts)
 
 
 _SAME_RATE = 0.02
