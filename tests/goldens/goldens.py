@@ -158,23 +158,30 @@ _AVX512_SKX = 256
 """OpenCV's number of that set of instructions, which its Python names no more."""
 
 
+def kernels() -> dict[str, str]:
+    """Variables that choose kernels which all processors of today have.
+
+    Those for AVX-512 sum in another order: corners move by 1e-7 px, sigmas by 1e-6 of their size.
+    """
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return {}
+    chosen = {
+        "OPENBLAS_CORETYPE": "Haswell",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
+    }
+    if cv2.checkHardwareSupport(_AVX512_SKX):
+        # OpenCV complains where there is nothing to disable.
+        chosen["OPENCV_CPU_DISABLE"] = "AVX512-SKX"
+    return chosen
+
+
 def _environment() -> dict[str, str]:
-    """One width, no colours, one thread, this tree; kernels that all processors of today have."""
+    """One width, no colours, one thread, this tree, and `kernels`."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("CALIB_", "FORCE_"))}
     told = [str(ROOT), *filter(None, [kept.get("PYTHONPATH", "")])]
     fixed = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb", "PYTHONHASHSEED": "0", "LC_ALL": "C.UTF-8"}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    # Kernels for AVX-512 sum in another order: corners move by 1e-7 px, sigmas by 1e-6 of their size.
-    kernels = {}
-    if platform.machine() in ("x86_64", "AMD64"):
-        kernels |= {
-            "OPENBLAS_CORETYPE": "Haswell",
-            "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
-        }
-        if cv2.checkHardwareSupport(_AVX512_SKX):
-            # OpenCV complains where there is nothing to disable.
-            kernels["OPENCV_CPU_DISABLE"] = "AVX512-SKX"
-    return kept | fixed | threads | kernels | {"PYTHONPATH": os.pathsep.join(told)}
+    return kept | fixed | threads | kernels() | {"PYTHONPATH": os.pathsep.join(told)}
 
 
 def _version() -> str:

@@ -67,6 +67,8 @@ _ROUGH_SHARE = 0.06
 """Scatter of the edges over the radius above which a blob is no disc."""
 _LIT = 0.8
 """Share of the radius within which the light's slope is read; a blur takes alike from both sides."""
+_LIT_PX = 7.0
+"""Least radius of a disc whose light tells a slope: of one of 4 px the errors of a codec would, too."""
 _LIGHT_WAVES = np.exp(-1j * np.outer(_ANGLES, np.arange(1, 7)))
 _LIGHT = (np.arange(256) / 255.0) ** 2.2
 """Light by grey level: mixtures are mixtures of light, and cameras store about its root."""
@@ -263,7 +265,8 @@ def _edges(bgr: AnyArray, centre: FloatArray, radius: float) -> tuple[FloatArray
     lit, whole = r < _LIT * radius, M.mean(axis=0)
     light = (colours[:, lit] * r[lit, None] ** 2).mean(axis=1) @ whole / (r[lit] ** 3).mean()
     first, *others = np.abs(light @ _LIGHT_WAVES) ** 2
-    slope = max(1.0 - sum(others) / max(first, 1e-12), 0.0) * 2.0 / _RAYS * light @ _TOWARDS
+    share = max(1.0 - sum(others) / max(first, 1e-12), 0.0) if radius > _LIT_PX else 0.0
+    slope = share * 2.0 / _RAYS * light @ _TOWARDS
     further = (radius - 0.5 * r[within].mean()) * _TOWARDS @ slope
     M += np.outer(further, whole) / max(float(whole @ whole), 1e-9)
     beyond = r > 1.25 * radius + 1.0
