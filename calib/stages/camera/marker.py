@@ -351,7 +351,8 @@ def _box(bgr: AnyArray, ellipse: _Ellipse, colour: Colour) -> tuple[int, int, in
     near = np.hypot(u + left - ellipse.centre_px[0], v + top - ellipse.centre_px[1])
     inside = near < 0.8 * float(ellipse.axes_px.min())
     # A glint is paler, whatever the background asks for.
-    if not coloured(about, replace(colour, least=_LEAST_SATURATION))[inside].mean() > _LEAST_COLOURED:
+    usual = replace(colour, least=_LEAST_SATURATION)
+    if not (mask if usual == colour else coloured(about, usual))[inside].mean() > _LEAST_COLOURED:
         return None
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return left + int(columns[0]), top + int(rows[0]), left + int(columns[-1]), top + int(rows[-1])
