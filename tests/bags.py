@@ -73,7 +73,10 @@ def write_bag(
     names: dict[str, str] = NAMES,
     delay_ns: int = DELAY_NS,
 ) -> Path:
-    """A bag of one of `KINDS_OF_FORMAT`; commands, which have no stamp, are received without delay."""
+    """A bag of one of `KINDS_OF_FORMAT`; commands, which have no stamp, are received without delay.
+
+    It has a topic without messages as well.
+    """
     if form == "json":
         return _write_json(folder / "log.mcap", messages, names, delay_ns)
     first = form == "ros1"
@@ -82,6 +85,7 @@ def write_bag(
     plugin = StoragePlugin.SQLITE3 if form == "sqlite" else StoragePlugin.MCAP
     with Writer1(path) if first else Writer2(path, version=9, storage_plugin=plugin) as writer:
         connections: dict[str, Any] = {}
+        writer.add_connection("/imu/unused", KINDS["imu"], typestore=store)
         for kind, stamp, values in messages:
             if kind not in connections:
                 connections[kind] = writer.add_connection(names[kind], KINDS[kind], typestore=store)
@@ -111,6 +115,7 @@ def _write_json(path: Path, messages: Iterable[Message], names: dict[str, str], 
             described = {"type": "object", "properties": {name: {"type": "number"} for name in columns}}
             schema = writer.register_schema(kind, "jsonschema", json.dumps(described).encode())
             channels[kind] = writer.register_channel(names[kind], "json", schema)
+        writer.register_channel("/imu/unused", "json", schema)
         for kind, stamp, values in messages:
             time = {"sec": stamp // 1_000_000_000, "nsec": stamp % 1_000_000_000}
             body = {"timestamp": time, **dict(zip(_JSON[kind], values, strict=True))}

@@ -24,6 +24,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, package, pip_install
 from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown
+from calib.core.words import several
 from calib.io.columns import COLUMNS, Block, Passed
 
 # ----------------------------------------------------------------------
@@ -42,8 +43,9 @@ from calib.io.columns import COLUMNS, Block, Passed
 #         pwm1: data[0]
 #         gz_radps: {field: rates.z, factor: 0.017453292519943295}
 #
-# Without the file the only topic of sensor_msgs/Imu is the IMU, `/marker` (a point) the marker and `/pwm`
-# (an array) the commands; fields of JSON messages that bear a column's name are that column.
+# Without `topics` the only topic of sensor_msgs/Imu is the IMU, `marker` (a point) the marker and `pwm` (an
+# array) the commands, in whatever namespace; fields of JSON messages that bear a column's name are that
+# column. Topics without messages are passed over.
 
 IMU = {
     "ax_mps2": "linear_acceleration.x",
@@ -69,11 +71,18 @@ _SHOWN = 8
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its name, its type as package/Name, and the fields of its JSON schema."""
+    """A topic of a bag: its name, its type as package/Name, the fields of its JSON schema, whether it has any
+    messages."""
 
     name: str
     kind: str
     fields: tuple[str, ...] = ()
+    used: bool = True
+
+
+def in_use(topics: Sequence[Topic]) -> Sequence[Topic]:
+    """Those that have messages; all where none has."""
+    return [topic for topic in topics if topic.used] or topics
 
 
 @dataclass(frozen=True)
@@ -149,12 +158,13 @@ def _fields(columns: Mapping[str, str]) -> tuple[Field, ...]:
 def _defaults(bag: Path, topics: Sequence[Topic]) -> TopicMap:
     source = shown(bag)
     found: dict[str, tuple[Field, ...]] = {}
+    topics = in_use(topics)
     imus = [topic for topic in topics if topic.kind == "sensor_msgs/Imu"]
     hint = f"say which in {shown(bag.stem)}.topics.yaml beside it"
     if len(imus) > 1:
         raise BadInputError(f"{source}: has {len(imus)} topics of sensor_msgs/Imu: {_listed(imus)}; {hint}")
     for topic in topics:
-        named = topic.name.strip("/")
+        named = topic.name.rsplit("/", 1)[-1]
         kind = "imu" if topic in imus else named if named in ("marker", "pwm") else ""
         columns = _preset(kind, topic) if kind else None
         if columns is None:
@@ -180,7 +190,9 @@ def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
     time = document.get("time", "stamp")
     if time not in ("stamp", "received"):
         raise BadInputError(f"{source}: time is {quoted(time)}, expected stamp or received")
-    listed = document.get("topics")
+    if "topics" not in document:
+        return replace(_defaults(bag, topics), stamped=time == "stamp")
+    listed = document["topics"]
     if not isinstance(listed, dict) or not listed:
         raise BadInputError(f"{source}: topics is {quoted(listed)}, expected topics with their columns")
     there = {topic.name: topic for topic in topics}
@@ -351,25 +363,88 @@ def _stamp(message: Any) -> int | None:
     return whole if 0 < whole < 2**63 else None
 
 
-def _merged(stamps: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Rows of one stamp as one, where no column has two values; rows are sorted."""
+def _merged(stamps: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray, int]:
+    """Rows of one stamp as one, where no column has two values, and how many said the same again.
+
+    Rows are sorted.
+    """
     if len(stamps) < 2 or not np.any(stamps[1:] == stamps[:-1]):
-        return stamps, values
+        return stamps, values, 0
     begin = np.nonzero(np.concatenate([[True], stamps[1:] != stamps[:-1]]))[0]
     there = ~np.isnan(values)
-    counts = np.add.reduceat(there.astype(np.int64), begin, axis=0)
-    sums = np.add.reduceat(np.where(there, values, 0.0), begin, axis=0)
-    alone = np.all(counts <= 1, axis=1)
+    most = np.maximum.reduceat(np.where(there, values, -np.inf), begin, axis=0)
+    least = np.minimum.reduceat(np.where(there, values, np.inf), begin, axis=0)
+    alone = np.all(most <= least, axis=1)
     group = np.cumsum(np.concatenate([[True], stamps[1:] != stamps[:-1]])) - 1
     keep = ~alone[group]
     keep[begin] = True
     out = values.copy()
-    out[begin[alone]] = np.where(counts > 0, sums, np.nan)[alone]
-    return stamps[keep], out[keep]
+    out[begin[alone]] = np.where(least < np.inf, least, np.nan)[alone]
+    again = np.add.reduceat(there.astype(np.int64), begin, axis=0)[alone].max(axis=1, initial=1) - 1
+    return stamps[keep], out[keep], int(again.sum())
 
 
-def _chunks(source: str, stream: Source, topics: TopicMap) -> Iterator[tuple[IntArray, FloatArray]]:
-    """Stamps and values in the order of the file, some thousand messages at a time."""
+# ----------------------------------------------------------------------
+# Whose clock the topics of a bag are stamped by, as far as the times of reception tell.
+
+_OTHER_CLOCK_S = 1.0
+"""What stamps of two topics may be apart from their reception: a camera that works for long is no clock."""
+
+
+@dataclass
+class _Clock:
+    """Times of a topic's messages: how many have a header without a stamp, by how much stamps are before the
+    reception at least, and the first and the last."""
+
+    unset: int = 0
+    late_ns: float = math.inf
+    first_ns: float = math.inf
+    last_ns: float = -math.inf
+
+    def time(self, message: Any, received_ns: int, stamped: bool) -> int:
+        """The message's time [ns]."""
+        stamp = _stamp(message) if stamped else None
+        if stamp is None:
+            stamp = received_ns
+            self.unset += stamped and getattr(message, "header", None) is not None
+        self.late_ns = min(self.late_ns, received_ns - stamp)
+        self.first_ns, self.last_ns = min(self.first_ns, stamp), max(self.last_ns, stamp)
+        return stamp
+
+
+def _odd_times(source: str, clocks: Mapping[str, _Clock]) -> str:
+    """A sentence on topics by another clock than the others, or without stamps; "" for none.
+
+    Raises `BadInputError` where topics by two clocks have no time in common.
+    """
+    by_late = sorted((clock.late_ns, name) for name, clock in clocks.items() if math.isfinite(clock.late_ns))
+    if not by_late:
+        return ""
+    (least_ns, low), (most_ns, high) = by_late[0], by_late[-1]
+    if most_ns - least_ns > 1e9 * _OTHER_CLOCK_S:
+        said = (
+            f"{one_line(high)[:80]} has stamps {most_ns / 1e9:.3f} s before their reception, "
+            f"{one_line(low)[:80]} {least_ns / 1e9:.3f} s"
+        )
+        a, b = clocks[low], clocks[high]
+        if a.first_ns > b.last_ns or b.first_ns > a.last_ns:
+            raise BadInputError(
+                f"{source}: {said}: two clocks with no time in common; the line time: received in a "
+                "topics.yaml beside it takes the times of reception"
+            )
+        return f"{said}, as of two clocks"
+    unset = [name for name, clock in clocks.items() if clock.unset]
+    if unset:
+        count = sum(clocks[name].unset for name in unset)
+        names = several([one_line(name)[:80] for name in unset])
+        return f"{count} messages of {names} have no stamp in their header; taken when they were received"
+    return ""
+
+
+def _chunks(
+    source: str, stream: Source, topics: TopicMap, clocks: dict[str, _Clock]
+) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Stamps and values in the order of the file, some thousand messages at a time; `clocks` are filled."""
     slots = {name: k for k, name in enumerate(topics.columns)}
     readers: dict[str, list[tuple[int, Callable[[Any], float]]]] = {
         name: [(slots[field.column], reader_of(source, name, field)) for field in fields]
@@ -378,8 +453,7 @@ def _chunks(source: str, stream: Source, topics: TopicMap) -> Iterator[tuple[Int
     stamps, values = np.empty(_ROWS, dtype=np.int64), np.full((_ROWS, len(slots)), np.nan)
     filled = 0
     for name, received, message in stream.messages(list(readers)):
-        stamp = _stamp(message) if topics.stamped else None
-        stamps[filled] = received if stamp is None else stamp
+        stamps[filled] = clocks[name].time(message, received, topics.stamped)
         row = values[filled]
         for slot, read in readers[name]:
             row[slot] = read(message)
@@ -397,23 +471,24 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
     Raises `BadInputError` for a message without an expected field.
     """
     columns = topics.columns
+    clocks = {name: _Clock() for name in topics.topics}
     start, first = None, 1
 
     def made(stamps: IntArray, values: FloatArray) -> Block:
         nonlocal start, first
         infinite = int(np.count_nonzero(np.isinf(values)))
-        stamps, values = _merged(stamps, np.where(np.isinf(values), np.nan, values))
+        stamps, values, twice = _merged(stamps, np.where(np.isinf(values), np.nan, values))
         if start is None and len(stamps):
             start = int(stamps[0]) if stamps[0] >= _EPOCH_NS else 0
         t_s = (stamps - (start or 0)) / 1e9
         lines = np.arange(first, first + len(stamps), dtype=np.int64)
         first += len(stamps)
         named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
-        return Block({"t_s": t_s, **named}, lines, Passed(infinite))
+        return Block({"t_s": t_s, **named}, lines, Passed(infinite, twice=twice))
 
     stamps, values = np.empty(0, dtype=np.int64), np.empty((0, len(columns)))
     try:
-        for more, others in _chunks(source, stream, topics):
+        for more, others in _chunks(source, stream, topics, clocks):
             # Rows that nothing can precede any more.
             ready = int(np.searchsorted(stamps, stamps[-1] - int(WINDOW_S * 1e9))) if len(stamps) else 0
             if ready:
@@ -422,7 +497,8 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
         last = made(stamps, values)
-        yield replace(last, passed=last.passed + Passed(truncated=stream.truncated))
+        passed = last.passed + Passed(truncated=stream.truncated, times=_odd_times(source, clocks))
+        yield replace(last, passed=passed)
     except OverflowError as error:
         raise BadInputError(f"{source}: has a time that is none: {error}") from error
 
@@ -615,7 +691,7 @@ def bag_blocks(path: Path, topics: Path | None = None) -> Iterator[tuple[tuple[s
     """
     with opened_bag(path) as stream:
         read = topic_map(path, stream.topics, topics)
-        left_out = tuple(topic.name for topic in stream.topics if topic.name not in read.topics)
+        left_out = tuple(one.name for one in stream.topics if one.used and one.name not in read.topics)
         yield left_out, rows_from_messages(shown(path), stream, read)
 
 
@@ -669,7 +745,8 @@ class _RosBag:
         self._reader, self._packing = reader, packing
         self.truncated = False
         kinds = {connection.topic: _kind(connection.msgtype) for connection in reader.connections}
-        self.topics = tuple(Topic(name, kinds[name]) for name in sorted(kinds))
+        used = {connection.topic for connection in reader.connections if connection.msgcount}
+        self.topics = tuple(Topic(name, kinds[name], used=name in used) for name in sorted(kinds))
 
     def messages(self, names: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         wanted = set(names)
@@ -723,17 +800,24 @@ class _Mcap:
         spans = sorted((c.chunk_start_offset, c.message_start_time, c.message_end_time) for c in chunks)
         self._jumbled = any(after[1] < before[2] for before, after in pairwise(spans))
         channels: dict[str, tuple[Any, Any]] = {}
+        used = set[str]()
         if summary is not None:
+            counts = {} if summary.statistics is None else summary.statistics.channel_message_counts
             for channel in summary.channels.values():
                 channels[channel.topic] = (summary.schemas.get(channel.schema_id), channel)
+                # Without counts any may have messages.
+                used |= {channel.topic} if counts.get(channel.id) or not counts else set()
         else:
             for schema, channel, _ in self._all(None):
                 channels.setdefault(channel.topic, (schema, channel))
+            used = set(channels)
         if self.truncated and not channels:
             raise BadInputError(f"{shown(path)}: ends within its first messages; {_mend(path)}")
         if len(channels) > _MOST_TOPICS:
             raise BadInputError(f"{shown(path)}: has {len(channels)} topics, expected at most {_MOST_TOPICS}")
-        self.topics = tuple(_mcap_topic(name, *channels[name]) for name in sorted(channels))
+        self.topics = tuple(
+            replace(_mcap_topic(name, *channels[name]), used=name in used) for name in sorted(channels)
+        )
 
     def _summary(self) -> Any:
         """The index at the end; None for a file that was not closed."""

@@ -273,6 +273,7 @@ class Passed:
     twice : rows that say what the one before says, at its time, and were left out.
     said : lines of words alone between the rows, as a board prints them.
     damaged : lines that are no row, few among many. damage : what is wrong with the first of them.
+    times : what is odd about the times of a bag's messages, in words.
     """
 
     not_finite: int = 0
@@ -288,6 +289,7 @@ class Passed:
     said: int = 0
     damaged: int = 0
     damage: str = ""
+    times: str = ""
 
     def __add__(self, later: Passed) -> Passed:
         return Passed(
@@ -304,6 +306,7 @@ class Passed:
             self.said + later.said,
             self.damaged + later.damaged,
             self.damage or later.damage,
+            self.times or later.times,
         )
 
     @property
@@ -329,7 +332,7 @@ class Passed:
                 f"{self.damaged} lines came damaged and are left out, the first {self.damage}",
             ),
         )
-        return [sentence for there, sentence in kinds if there]
+        return [sentence for there, sentence in (*kinds, (self.times, self.times)) if there]
 
 
 ALL_TAKEN = Passed()

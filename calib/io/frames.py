@@ -265,10 +265,11 @@ _GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 
 
 def _of_bag(path: Path, topic: str | None) -> Iterator[GrayImage]:
-    from calib.io.bags import opened_bag
+    from calib.io.bags import in_use, opened_bag
 
     with opened_bag(path) as stream:
-        kinds = {one.name: one.kind for one in stream.topics if one.kind in (_IMAGE, _COMPRESSED)}
+        pictures = [one for one in stream.topics if one.kind in (_IMAGE, _COMPRESSED)]
+        kinds = {one.name: one.kind for one in in_use(pictures)}
         listed = ", ".join(one_line(name)[:80] for name in kinds) or "none"
         if topic is not None and topic not in kinds:
             raise BadInputError(f"{shown(path)}: has no image topic {one_line(topic)[:80]}; found {listed}")

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -272,6 +273,38 @@ def test_the_stamp_of_a_message_or_its_reception(body: dict[str, Any], seconds: 
     assert rows([("/b", 4_000_000_000, {"g": 1.0, **body})], received)[0][0, 0] == 4.0
 
 
+@pytest.mark.parametrize(
+    ("sec", "said"),
+    [
+        (3.997, ""),
+        (2.0, "/a has stamps 2.000 s before their reception, /b 0.000 s, as of two clocks"),
+        (0.0, "2 messages of /a have no stamp in their header; taken when they were received"),
+        (0.5, "/a has stamps 3.500 s before their reception, /b 0.000 s: two clocks with no time in common"),
+    ],
+)
+def test_stamps_by_two_clocks_and_none(sec: float, said: str) -> None:
+    def marker(received: int) -> tuple[str, int, Any]:
+        stamp = round(sec * 1e9) + received - 4 * 10**9 if sec else 0
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9))
+        return ("/a", received, SimpleNamespace(header=header, u=1.0, v=received / 1e9))
+
+    rates = [("/b", second * 10**9, {"g": 1.0}) for second in (2, 4)]
+    items = [*rates, marker(4 * 10**9), marker(5 * 10**9)]
+    if "no time" in said:
+        with pytest.raises(BadInputError, match=said):
+            rows(items)
+        rows(items, TopicMap(MAP.source, MAP.topics, stamped=False))
+    else:
+        assert rows(items)[1][-1].passed.times == said
+
+
+def test_a_message_that_two_bags_hold_counts_once() -> None:
+    items = [("/a", 1, {"u": 1.0, "v": 2.0}), ("/b", 1, {"g": 3.0}), ("/b", 2, {"g": 4.0})]
+    found, blocks = rows([*items, *items])
+    assert np.array_equal(found, rows(items)[0], equal_nan=True)
+    assert sum(block.passed.twice for block in blocks) == 2
+
+
 @settings(max_examples=80, deadline=None)
 @given(
     st.lists(st.tuples(st.sampled_from(["/a", "/b"]), st.integers(0, 40)), max_size=60),
@@ -306,6 +339,15 @@ def _map(text: str, tmp_path: Path, topics: tuple[Topic, ...] = TOPICS):
     file = tmp_path / "mine.yaml"
     file.write_text(text)
     return topic_map(tmp_path / "log.bag", topics, file)
+
+
+def test_namespaces_and_topics_without_messages(tmp_path: Path) -> None:
+    spaced = tuple(replace(one, name=f"/rig1{one.name}") for one in TOPICS)
+    unused = Topic("/imu/raw", "sensor_msgs/Imu", used=False)
+    for text in ("time: received\n", "time: stamp\n"):
+        found = _map(text, tmp_path, (*spaced, unused))
+        assert list(found.topics) == ["/rig1/imu", "/rig1/marker", "/rig1/pwm", "/rig1/own"]
+        assert found.stamped is (text == "time: stamp\n")
 
 
 @pytest.mark.parametrize(
