@@ -273,7 +273,9 @@ def simulate_pump(
 # from several starts. A simulation runs free: it sees the PWM and the first fifth of a second of the
 # measured values, nothing else. What is left over is the models' error and not noise, so it is coloured;
 # standard deviations are therefore those of a sandwich, H^-1 (sum g g^T) H^-1, with the gradient g summed
-# over whole recordings, or over stretches of a second where there are fewer than four recordings.
+# over whole recordings, or over stretches of a second where there are fewer than four recordings. Where
+# recordings differ by more than what counts as one, the robust loss is all but that of a median, and H is
+# made by the few rows near it; so none is less than what leaving out each recording in turn says (jackknife).
 #
 # A parameter that can be switched off (a limit, a leak, a hose) is taken only if the data ask for it, by
 # two measures. One that they do not ask for lowers the robust cost all the same, by lambda chi^2_1 / 2,
@@ -363,10 +365,11 @@ class Held:
 
     `settles` is by how much it ends above the free run, over its last second; NaN where it does not run near
     full PWM then. `level` is by how much another level would explain the whole run better; NaN where it
-    hardly runs at a PWM that tells.
+    hardly runs at a PWM that tells. `theta` are the parameters of the free run.
     """
 
     name: str
+    theta: FloatArray
     rms: float
     ahead: float
     settles: float = math.nan
@@ -674,7 +677,7 @@ def held_by(fit: PumpFit, record: PumpRecord) -> Held:
     rises = (replace(fit, theta=more).run(record) - run) / (_LITTLE * fit.theta[at])
     tells = float(np.mean(rises**2)) > _FOLLOWS**2
     level = float(rises @ off) / float(rises @ rises) if tells else math.nan
-    return Held(record.name, rms(off), rms_ahead(fit, record), settles, level)
+    return Held(record.name, fit.theta, rms(off), rms_ahead(fit, record), settles, level)
 
 
 def _near_full(record: PumpRecord) -> BoolArray | None:
@@ -685,12 +688,17 @@ def _near_full(record: PumpRecord) -> BoolArray | None:
 
 
 def with_run_sigma(fit: PumpFit, held: Sequence[Held]) -> tuple[PumpFit, float]:
-    """The fit with a level whose deviation holds for a further run, and what runs add to it.
+    """The fit with deviations by runs left out, that of the level for a further run, and what runs add to it.
 
-    Runs of one pump settle apart for reasons that no PWM tells. How the samples of a run scatter says nothing
-    of that; by how much held runs end off their prediction does, or are off it as a whole. NaN for fewer than
-    two.
+    None is less than that of the jackknife, sqrt((n - 1) / n sum (theta_i - mean)^2). Runs of one pump settle
+    apart for reasons that no PWM tells. How the samples of a run scatter says nothing of that; by how much
+    held runs end off their prediction does, or are off it as a whole. NaN for fewer than two.
     """
+    if not held:
+        return fit, math.nan
+    names = [p.name for p in MODELS[fit.model]]
+    moved = math.sqrt(len(held) - 1) * np.std([one.theta for one in held], axis=0)
+    fit = replace(fit, sigma={k: max(s, float(moved[names.index(k)])) for k, s in fit.sigma.items()})
     told = [[abs(x) for x in (one.settles, one.level) if math.isfinite(x)] for one in held]
     off = [max(one) for one in told if one]
     if len(off) < 2 or "level" not in fit.sigma:
