@@ -19,6 +19,8 @@ PICTURES = (
     ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".heic", ".heif", ".avif",
 )  # fmt: skip
 """Endings of picture files."""
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".mjpeg")
+"""Endings of videos."""
 BAGS = (".bag", ".db3", ".mcap")
 """Endings of bags; a ROS 2 bag may also be a folder."""
 _MAX_YAML_BYTES = 1_000_000

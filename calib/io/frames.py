@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError, UsageError
-from calib.core.files import check_readable, hash_of, is_bag, one_line, shown
+from calib.core.files import VIDEOS, check_readable, hash_of, is_bag, one_line, shown
 from calib.io.pictures import Picture, decoded_picture, eight_bits, fields_of
 
 # ----------------------------------------------------------------------
@@ -22,7 +22,6 @@ from calib.io.pictures import Picture, decoded_picture, eight_bits, fields_of
 # many stretches, neighbours are joined and stretches are twice as long from then on. So the number of
 # frames need not be known, and the same file gives the same frames.
 
-VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".mjpeg")
 _STRETCHES = 40
 """Between so many and twice as many frames are looked at."""
 _FEWEST_STRETCHES = 8

@@ -209,7 +209,9 @@ def _record(jobs: Sequence[Mapping[str, Any]], sections: Mapping[str, Any]) -> l
     then: list[str] = []
     for job in jobs:
         wanted = _RECORD.get(str(job["stage"]))
-        if job["status"] == "skipped" and wanted and job["log"] is None:
+        # What the folder's own rig.yaml tells need not be recorded, nor what waits for another stage.
+        there = job["inputs"] or (job["writes"] and all(name in sections for name in job["writes"]))
+        if job["status"] == "skipped" and wanted and job["log"] is None and not there:
             lacking.append(f"{job['title']}: {wanted}")
         for name in job["writes"]:
             section = sections.get(name)

@@ -25,7 +25,7 @@ from pydantic import AfterValidator, ConfigDict
 from calib.core.arrays import FloatArray
 from calib.core.constants import constants
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError, CalibError, end_of
-from calib.core.files import PICTURES, one_line, read_yaml_mapping, sha256, shown
+from calib.core.files import PICTURES, VIDEOS, one_line, read_yaml_mapping, sha256, shown
 from calib.core.options import name_of_flag, options_of
 from calib.core.plot import every
 from calib.core.result import Section
@@ -37,7 +37,7 @@ from calib.core.workers import Processes, Task
 from calib.core.writing import make_folder
 from calib.io.tables import read_cells
 from calib.runner.cache import key_of, program
-from calib.runner.folder import Folder, folder_digests, read_folder
+from calib.runner.folder import LOGS, Folder, folder_digests, read_folder
 from calib.runner.graph import STEPS, Runner, opened_run
 from calib.runner.outcomes import (
     LIMIT_S,
@@ -270,7 +270,7 @@ SCHEMES = ("file", "gs", "https", "s3")
 MOST_BYTES = 4_000_000_000
 _MOST_FILES = 20_000
 _PIECE = 1 << 20
-_SUFFIXES = (*PICTURES, ".csv", ".parquet", ".yaml")
+_SUFFIXES = (*PICTURES, *VIDEOS, *LOGS, ".yaml")
 _FOLDERS = ("", "images", "images/plane", "logs")
 _FINAL = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, NotImplementedError)
 """Another attempt would end in the same; the last is fsspec's for what a kind of URL cannot do."""

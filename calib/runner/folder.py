@@ -7,16 +7,17 @@ must not bring files of this machine into a page that is passed on.
 from __future__ import annotations
 
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from calib.core.errors import BadInputError
-from calib.core.files import PICTURES, file_sha256, inside, one_line, shown, slug, to_be
+from calib.core.files import PICTURES, VIDEOS, file_sha256, inside, one_line, shown, slug, to_be
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.words import several
 
-_LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
+LOGS = (".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3")
+"""Endings of logs in logs/."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ class Folder:
 
     Attributes
     ----------
-    pictures, plane : picture files; board, plane_board : their board.yaml, None without.
+    pictures, plane : picture files, where there are none videos, of the plane one; board, plane_board : their
+        board.yaml, None without.
     logs : in the order of their names.
     rig : the folder's own rig.yaml, None without.
     left_out : sentences on files that were not taken.
@@ -111,10 +113,10 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     # Pictures alone may lie in the folder itself.
     flat = not any((root / name).is_dir() for name in ("images", "logs"))
     pictures, board = _pictures(root if flat else root / "images", taken)
-    plane, plane_board = _pictures(root / "images" / "plane", taken)
+    plane, plane_board = _pictures(root / "images" / "plane", taken, videos=1)
     logs: list[LogFile] = []
     states: list[Path] = []
-    for path in _listed(root / "logs", _LOGS):
+    for path in _listed(root / "logs", LOGS):
         if not all(taken(part) for part in with_beside([path])):
             continue
         if STATES_FILE.ours(path):
@@ -126,13 +128,13 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     rig = own if own.is_file() and taken(own) else None
     beside = [
         path
-        for path in _listed(root, _LOGS)
+        for path in _listed(root, LOGS)
         if path.is_file()
         and not path.is_symlink()
         and columns_of(path, options)
         and not STATES_FILE.ours(path)
     ]
-    left_out += _passed_over(root, flat, beside)
+    left_out += _passed_over(root, flat, beside, {*pictures, *plane})
     if states:
         left_out.append(f"logs/: states that calib replay has written, left out: {_names(states)}")
     if arms := [log.path for log in logs if is_arm_log(log.columns or ())]:
@@ -149,14 +151,21 @@ def _named(path: Path, root: Path) -> str:
     return one_line(path.relative_to(root).as_posix())
 
 
-def _pictures(folder: Path, taken: Callable[[Path], bool]) -> tuple[tuple[Path, ...], Path | None]:
+def _pictures(
+    folder: Path, taken: Callable[[Path], bool], videos: int | None = None
+) -> tuple[tuple[Path, ...], Path | None]:
+    """Pictures, where there are none videos, so many at most; and what says which board they show."""
     pictures = tuple(path for path in _listed(folder, PICTURES) if taken(path))
+    pictures = pictures or tuple(path for path in _listed(folder, VIDEOS) if taken(path))[:videos]
     board = folder / "board.yaml"
     return pictures, board if board.exists() and taken(board) else None
 
 
-def _passed_over(root: Path, flat: bool, logs: Iterable[Path]) -> list[str]:
-    """Sentences on files and folders that a person may have meant to be read, `logs` outside of logs/ too."""
+def _passed_over(root: Path, flat: bool, logs: Iterable[Path], pictures: Collection[Path]) -> list[str]:
+    """Sentences on files and folders that a person may have meant to be read, `logs` outside of logs/ too.
+
+    `pictures` are those that are read.
+    """
     misplaced = [(root / "plane", "images/plane/"), *((path, "logs/") for path in logs)]
     names = ["images", "logs", "rig.yaml", "images/plane", "images/board.yaml", "images/plane/board.yaml"]
     meant = [root / name for name in (*names, *(["board.yaml"] if flat else []))]
@@ -174,13 +183,25 @@ def _passed_over(root: Path, flat: bool, logs: Iterable[Path]) -> list[str]:
     strange = [path for path in folders if path.name.lower() not in ("plane", "dropped")]
     if strange:
         said.append(f"images/: {_names(strange)} left out, folders are not looked into")
-    strange = [path for path in _entries(root / "logs") if path.suffix.lower() not in (*_LOGS, ".yaml")]
+    for place, videos in (("images", "videos"), ("images/plane", "one video")):
+        files = [path for path in _entries(root / place) if path.is_file() and inside(path, root)]
+        strange = [path for path in files if path not in pictures and not _beside_pictures(path)]
+        if strange:
+            said.append(
+                f"{place}/: {_names(strange)} left out, expected pictures, or where there are none {videos}"
+            )
+    strange = [path for path in _entries(root / "logs") if path.suffix.lower() not in (*LOGS, ".yaml")]
     if strange:
-        *most, last = _LOGS
+        *most, last = LOGS
         said.append(
             f"logs/: {_names(strange)} left out, expected logs that end in {', '.join(most)} or {last}"
         )
     return said
+
+
+def _beside_pictures(path: Path) -> bool:
+    """Whether a file belongs beside pictures: a board.yaml, or what a system puts there."""
+    return path.suffix.lower() in (".yaml", ".yml") or path.name.lower() in ("thumbs.db", "desktop.ini")
 
 
 def _names(paths: Iterable[Path]) -> str:

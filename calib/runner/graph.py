@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, BadInputError
-from calib.core.files import file_sha256, inside, one_line, shown
+from calib.core.files import VIDEOS, file_sha256, inside, one_line, shown
 from calib.core.result import Result as StageResult
 from calib.core.rig import Rig
 from calib.core.verdict import worst
@@ -116,12 +116,14 @@ def _logs(folder: Folder, kind: str, *columns: str) -> tuple[Path, ...]:
 
 
 def _linked(folder: Folder, start: str) -> str:
-    return next((sentence for sentence in folder.left_out if sentence.startswith(start)), "")
+    """What was left out of a folder, or of a file's place, that a stage would read."""
+    told = (one for one in folder.left_out if one.startswith(start) and not one.startswith(f"{start}:"))
+    return next(told, "")
 
 
 def _intrinsics(folder: Folder, job: Job) -> Job:
     if not folder.pictures:
-        return job.skipped("no pictures in images/")
+        return job.skipped("no pictures and no videos in images/")
     if linked := _linked(folder, "images/board.yaml"):
         return job.skipped(linked)
     board = () if folder.board is None else (folder.board,)
@@ -130,11 +132,14 @@ def _intrinsics(folder: Folder, job: Job) -> Job:
 
 def _extrinsics(folder: Folder, job: Job) -> Job:
     if not folder.plane:
-        return job.skipped("no pictures in images/plane/")
+        return job.skipped("no pictures and no video in images/plane/")
     if linked := _linked(folder, "images/plane/"):
         return job.skipped(linked)
     board = () if folder.plane_board is None else (folder.plane_board,)
-    return replace(job, paths=(folder.root / "images" / "plane",), inputs=(*folder.plane, *board))
+    # A video is given by itself, of pictures their folder.
+    video = folder.plane[0].suffix.lower() in VIDEOS
+    paths = folder.plane if video else (folder.root / "images" / "plane",)
+    return replace(job, paths=paths, inputs=(*folder.plane, *board))
 
 
 def _reading(kind: str, columns: tuple[str, ...], lacking: str, most: int | None = None) -> Plan:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.errors import EXIT_DONE, BadInputError
-from calib.core.files import file_sha256, one_line, sha256, shown
+from calib.core.files import VIDEOS, file_sha256, one_line, sha256, shown
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.rig import Rig
 from calib.core.workers import processors
@@ -239,7 +239,8 @@ def run_folder(runner: Runner, twin: bool = False, page: bool = True) -> Calibra
     told = summary(runner, ended, twin or rig.simulated)
     files = publish(runner, ended, told, rig, twin)
     if page:
-        keep_pictures(runner.folder.pictures, out / HIDDEN / "pictures")
+        pictures = [path for path in runner.folder.pictures if path.suffix.lower() not in VIDEOS]
+        keep_pictures(pictures, out / HIDDEN / "pictures")
         write_page(out / "rig.yaml")
         files.append("report.html")
     return Calibrated(out, decide(told, rig.values()), told, ended, tuple(files))

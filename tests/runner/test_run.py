@@ -28,7 +28,7 @@ from calib.core.workers import Task
 from calib.io.columns import STATES
 from calib.runner.decision import read_summary
 from calib.runner.folder import read_folder
-from calib.runner.graph import HIDDEN, STEPS, Job, Runner, opened_run
+from calib.runner.graph import HIDDEN, STEPS, Job, Runner, jobs_of, opened_run
 from calib.runner.outputs import run_folder
 from calib.show.page import keep_pictures, page_text, write_page
 
@@ -414,6 +414,8 @@ def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
         "logs/one.columns.yaml",
         "logs/~$one.csv",
         "images/Thumbs.db",
+        "images/view1.gif",
+        "images/board.mp4",
         "rig.yml",
         "swing2.csv",
     ):
@@ -428,10 +430,14 @@ def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
         "plane: was",
         "swing2.csv: was",
         "images/: day1",
+        "images/: board.mp4, view1.gif",
         "logs/: swing1.txt, tag1",
         "logs/: states that calib replay has written,",
     ]
     assert [log.slug for log in read.logs] == ["one", "two"]
+    for name in ("a.png", "b.png"):
+        (root / "images" / name).unlink()
+    assert [path.name for path in read_folder(root).pictures] == ["board.mp4"]
     other = tmp_path / "other"
     (other / "Images").mkdir(parents=True)
     if not (other / "images").is_dir():
@@ -449,6 +455,19 @@ def test_odd_names_stay_inside_and_run(tmp_path: Path, name: str) -> None:
     assert all(path.parent.parent == tmp_path or path.is_relative_to(out) for path in out.rglob("*"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "rig"]
     assert all(part.isascii() and part.isprintable() for part in states)
+
+
+def test_of_the_plane_one_video_is_read(tmp_path: Path) -> None:
+    plane = make_folder(tmp_path / "rig") / "images" / "plane"
+    plane.mkdir(exist_ok=True)
+    for name in ("rest.mp4", "rest2.mp4"):
+        (plane / name).write_text("")
+    folder = read_folder(tmp_path / "rig")
+    (job,) = (job for job in jobs_of(folder) if job.name == "extrinsics")
+    assert job.paths == job.inputs == (plane.absolute() / "rest.mp4",)
+    assert folder.left_out == (
+        "images/plane/: rest2.mp4 left out, expected pictures, or where there are none one video",
+    )
 
 
 def test_every_stage_comes_after_what_it_reads() -> None:

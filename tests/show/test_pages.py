@@ -291,7 +291,7 @@ def _job(stage: str, status: str = "ok", **more: Any) -> dict[str, Any]:
     reason = "" if status == "ok" else "for some reason"
     return {
         "name": stage, "stage": stage, "title": stage.title(), "log": None, "writes": writes,
-        "flashed": flashed, "status": status, "reason": reason, **more,
+        "flashed": flashed, "status": status, "reason": reason, "inputs": [], **more,
     }  # fmt: skip
 
 
@@ -366,6 +366,13 @@ def test_what_means_nothing_is_recorded_again_first() -> None:
         told = _whole(intrinsics=word, extrinsics="skipped")
         record = decide(told, {"camera": {"verdict": word, "advice": ["Tilt the board."]}}).record
         assert len(record) == 2 and record[at] == "Intrinsics: Tilt the board."
+
+
+def test_what_is_known_or_waits_for_another_stage_is_not_asked_for() -> None:
+    told = _whole(intrinsics="skipped", extrinsics="skipped", imu_static="skipped")
+    told["jobs"][2]["inputs"] = ["logs/static1.csv"]
+    (sentence,) = decide(told, {"camera": {"verdict": "ok"}}).record
+    assert sentence.startswith("Extrinsics: a picture of the board")
 
 
 def test_the_policy_is_that_of_the_script() -> None:
