@@ -87,6 +87,9 @@ STATES = (
 BASELINE = ("t_s", "q1_m", "q2_m", "phi_rad", "length_m", "x_m", "y_m")
 """Columns of what the published pipeline estimates."""
 
+FOR_A_PERSON = ("sigma_px",)
+"""What `calib track` writes beside the marker, which no verb reads."""
+
 ACCEL = ("ax_mps2", "ay_mps2", "az_mps2")
 GYRO = ("gx_radps", "gy_radps", "gz_radps")
 
@@ -489,8 +492,8 @@ class ColumnMap:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Names of the file's columns that are not read."""
-        read = self.read.values()
+        """Names of the file's columns that are not read and might be meant to be."""
+        read = {*self.read.values(), *FOR_A_PERSON}
         return tuple(name for name in self.names if name and name not in read)
 
     @property
