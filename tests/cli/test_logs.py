@@ -314,10 +314,11 @@ def test_one_recording_is_a_csv(calib: Run, tmp_path: Path, words: tuple[str, ..
         assert ended.code == 2 and f"{name}: expected a name that ends in .csv" in ended.err
     assert list(tmp_path.iterdir()) == []
 
+
+def test_two_logs_become_one(calib: Run, tmp_path: Path) -> None:
     (tmp_path / "track.csv").write_text(
         "t_s,u_px,v_px,sigma_px,note\n0.005,1,2,0.1,\n0.02,3,4,0.1,\n9,5,6,0.1,\n"
     )
-    (tmp_path / "track.csv").write_text("t_s,u_px,v_px,sigma_px\n0.005,1,2,0.1\n0.02,3,4,0.1\n9,5,6,0.1\n")
     (tmp_path / "board.csv").write_text("t_s,gz_radps,pwm1,pwm2\n0,0.1,0,0\n0.01,0.2,,\n0.02,0.3,9,9\n")
     words = ("join", "track.csv", "board.csv", "--same-clock", "-o")
     ended = calib(*words, "log.csv", cwd=tmp_path)
