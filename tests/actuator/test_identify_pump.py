@@ -31,7 +31,9 @@ from calib.stages.actuator.identify_pump import (
     fit_pump,
     identify_pump,
     judge_pump,
+    jumps,
     pump_section,
+    settled_groups,
     simulate_pump,
     unexplained,
     with_run_sigma,
@@ -282,6 +284,19 @@ def test_what_the_pwm_does_not_explain_makes_it_poor(found: PumpFound) -> None:
     assert verdict.word == "poor" and any("look for a leak" in one for one in verdict.advice)
     assert odd.main_group is not None
     assert odd.held_rms(LAG, odd.main_group.files) < odd.held_rms(LAG)
+
+
+def test_what_is_no_fault_of_a_run_is_none() -> None:
+    """A sensor that is slower than the log, and runs that have not settled at full PWM."""
+    t = 0.02 * np.arange(200)
+    y = 30.0 * -np.expm1(-np.maximum(t - 0.04, 0.0) / 0.35)
+    slow = PumpRecord("slow", t, np.full(200, 255.0), y[5 * (np.arange(200) // 5)])
+    assert jumps([slow]) == ()
+    assert len(jumps([replace(slow, value=np.where(t < 0.1, 0.0, 8.0 + 0.5 * y))])) == 1
+    late = replace(slow, pwm=np.where(t < 3.3, 0.0, 255.0), value=np.where(t < 3.3, 0.0, 20.0 * (t - 3.3)))
+    less = replace(slow, pwm=np.full(200, 220.0), value=220.0 / 255.0 * y)
+    full = replace(slow, value=y)
+    assert [group.files for group in settled_groups([full, late, less])] == [["slow"]]
 
 
 def test_the_lag_of_runs_that_end_on_their_way_is_poor_where_it_is_no_lag(found: PumpFound) -> None:

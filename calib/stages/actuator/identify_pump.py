@@ -681,9 +681,11 @@ def held_by(fit: PumpFit, record: PumpRecord) -> Held:
 
 
 def _near_full(record: PumpRecord) -> BoolArray | None:
-    """Rows of a run's last second, where it runs near full PWM then and changes at all."""
+    """Rows of a run's last second, where it runs at full PWM but for a twentieth then and changes at all."""
     late = record.t_s >= record.t_s[-1] - _SETTLED_S
-    full = float(np.median(record.pwm[late])) >= 0.85 * 255.0 and float(np.ptp(record.value)) > 0.0
+    full = (
+        float(np.median(record.pwm[late])) >= (1.0 - _APART) * PWM_MAX and float(np.ptp(record.value)) > 0.0
+    )
     return late if full else None
 
 
@@ -732,14 +734,15 @@ class Departure:
 
 
 def settled_groups(records: Sequence[PumpRecord]) -> tuple[SettledRuns, ...]:
-    """Groups of runs by the value of their last second, for runs near full PWM then.
+    """Groups of runs by the value of their last second, for runs near full PWM that have settled by then.
 
-    Two groups are apart by more than a twentieth of the largest value.
+    Two groups are apart by more than a twentieth of the largest value. A value that moves by half of that
+    within the second, as behind a PWM that was another until then, has not settled.
     """
     ends = []
     for record in records:
         late = _near_full(record)
-        if late is not None:
+        if late is not None and _moves(record.value[late]) <= 0.5 * _APART:
             pwm = record.pwm[late]
             value = float(np.median(record.value[late]))
             ends.append((value, record.name, float(np.quantile(pwm, 0.05)), float(pwm.max())))
@@ -759,6 +762,13 @@ def settled_groups(records: Sequence[PumpRecord]) -> tuple[SettledRuns, ...]:
         )
         for group in groups
     )
+
+
+def _moves(value: FloatArray) -> float:
+    """How far values (n,) go from their first fifth to their last, as a part of the latter."""
+    some = len(value) // 5 + 1
+    begin, end = float(np.median(value[:some])), float(np.median(value[-some:]))
+    return abs(end - begin) / max(abs(end), 1e-12)
 
 
 def departures(fit: PumpFit, records: Sequence[PumpRecord]) -> tuple[Departure, ...]:
@@ -793,11 +803,13 @@ def jumps(records: Sequence[PumpRecord]) -> tuple[tuple[str, float, float], ...]
     """Runs that begin with a jump: name, its size, and the value before it.
 
     A jump is a rise within a tenth of a second that is more than twice as fast as that of the
-    tenth after it, and more than a twentieth of the range.
+    tenth after it, and more than a twentieth of the range. Of a reading that a slow sensor repeats the last
+    row counts.
     """
     out = []
     for record in records:
-        t, y = record.t_s - record.t_s[0], record.value
+        last = np.append(np.diff(record.value) != 0.0, True)
+        t, y = (record.t_s - record.t_s[0])[last], record.value[last]
         found = []
         for k in np.nonzero(t < 0.3)[0].tolist():
             after = np.searchsorted(t, t[k] + 0.4 * _JUMP_S)
