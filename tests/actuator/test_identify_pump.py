@@ -310,6 +310,20 @@ def test_the_lag_of_runs_that_end_on_their_way_is_poor_where_it_is_no_lag(found:
         assert any("the runs end at" in text for text in judge_pump(one).reasons) == told
 
 
+def test_tables_kept_out_and_the_lag_that_is_written_are_judged(found: PumpFound) -> None:
+    off = {LAG: [replace(found.held[LAG][0], name="other", rms=4.0)], ORIFICE: []}
+    assert (
+        "on other, kept out, the linear lag is off by 4.00 kPa"
+        in judge_pump(replace(found, asked=off)).reasons[0]
+    )
+    flow = {LAG: [replace(one, rms=4.0) for one in found.held[LAG]], ORIFICE: found.held[ORIFICE]}
+    assert any("so that lag and delay" in text for text in judge_pump(replace(found, held=flow)).reasons)
+    # None but for a hundredth of the lag is a dead time as good as any.
+    lag = found.fits[LAG]
+    none = replace(lag, theta=lag.theta * [0.0, 1.0, 1.0, 1.0], sigma={**lag.sigma, "dead_time_s": 0.005})
+    assert judge_pump(replace(found, fits={**found.fits, LAG: none})).word == "ok"
+
+
 def _write(path: Path, head: str, rows: np.ndarray) -> Path:
     lines = [",".join("" if c != c else f"{c:.6g}" for c in row) for row in rows.tolist()]
     path.write_text("\n".join([head, *lines]) + "\n")

@@ -365,11 +365,12 @@ class Held:
 
     `settles` is by how much it ends above the free run, over its last second; NaN where it does not run near
     full PWM then. `level` is by how much another level would explain the whole run better; NaN where it
-    hardly runs at a PWM that tells. `theta` are the parameters of the free run.
+    hardly runs at a PWM that tells. `theta`: parameters of the free run. `span`: range of the recording.
     """
 
     name: str
     theta: FloatArray
+    span: float
     rms: float
     ahead: float
     settles: float = math.nan
@@ -677,7 +678,8 @@ def held_by(fit: PumpFit, record: PumpRecord) -> Held:
     rises = (replace(fit, theta=more).run(record) - run) / (_LITTLE * fit.theta[at])
     tells = float(np.mean(rises**2)) > _FOLLOWS**2
     level = float(rises @ off) / float(rises @ rises) if tells else math.nan
-    return Held(record.name, fit.theta, rms(off), rms_ahead(fit, record), settles, level)
+    span = float(np.ptp(record.value))
+    return Held(record.name, fit.theta, span, rms(off), rms_ahead(fit, record), settles, level)
 
 
 def _near_full(record: PumpRecord) -> BoolArray | None:
@@ -1162,21 +1164,33 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
         return
     fit = found.fits[better]
     span = max(float(np.ptp(r.value)) for r in found.records)
-    rms = found.held_rms(better)
-    if rms is None:
-        yield Finding("remark", "one recording alone: no error on recordings not fitted")
-    elif rms > _MOST_SHARE * span:
-        yield Finding(
-            "poor",
-            f"on recordings not fitted the {better} is off by {rms:.2f} {found.unit} (RMS), "
-            f"{100.0 * rms / span:.0f} % of the range",
-            "record each run from an empty chamber, with the same supply and load",
-        )
     told = {model: found.fits[model] for model in dict.fromkeys((better, LAG))}
+    alone = found.held_rms(better) is None
+    if alone:
+        yield Finding("remark", "one recording alone: no error on recordings not fitted")
+    on = "on the one recording" if alone else "on recordings not fitted"
+    off = {model: found.held_rms(model) or one.rms for model, one in told.items()}
+    misses = [(on, better, off[better], span)]
+    misses += [(f"on {h.name}, kept out,", better, h.rms, max(h.span, span)) for h in found.asked[better]]
+    misses += [(on, LAG, off[LAG], span)] if better != LAG else []
+    for where, model, error, of in misses:
+        share = error / of
+        if share > _MOST_SHARE:
+            text = f"{where} the {model} is off by {error:.2f} {found.unit} (RMS), "
+            text += f"{100.0 * share:.0f} % of the range"
+            advice = "record each run from an empty chamber, with the same supply and load"
+            if model != better:
+                # Lag and dead time of that one go into the section.
+                text += ", so that lag and delay are not told"
+                advice = "record steps of the PWM up alone, from an empty chamber"
+            yield Finding("poor", text, advice)
     for model, name in ((model, name) for model, one in told.items() for name in one.sigma):
         value, sigma = abs(told[model].values[name]), told[model].sigma[name]
-        # Of the lag, lag and dead time go into the section, whichever model is better.
-        if name not in _PASSAGE and sigma > _MOST_VAGUE * value and (model == better or name in _WRITTEN):
+        # Of the lag, lag and dead time go into the section, whichever model is better. A dead time near
+        # zero is known well enough where it moves the rise by little.
+        enough = _MOST_SHARE * found.fits[LAG].values["lag_s"] if name == "dead_time_s" else 0.0
+        vague = sigma > max(_MOST_VAGUE * value, enough)
+        if name not in _PASSAGE and vague and (model == better or name in _WRITTEN):
             known = f"known to {100.0 * sigma / value:.0f} % only" if sigma < value else "not told by these"
             yield Finding(
                 "poor",
