@@ -7,6 +7,7 @@ import os
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +52,12 @@ def slug(name: str, taken: Iterable[str] = ()) -> str:
     """
     raw = name.encode("utf-8", "surrogateescape")
     text = "".join(c if c in _SAFE else "_" for c in name).lstrip(".-")[:_LONGEST]
-    if text != name or not text or text.lower() in {other.lower() for other in taken}:
-        text = f"{text or 'log'}_{hashlib.sha256(raw).hexdigest()[:6]}"
-    return text
+    names = {other.lower() for other in taken}
+    if text == name and text and text.lower() not in names:
+        return text
+    text = f"{text or 'log'}_{hashlib.sha256(raw).hexdigest()[:6]}"
+    # The third of one stem, as of a log in three formats.
+    return next(one for k in count(1) if (one := text if k == 1 else f"{text}_{k}").lower() not in names)
 
 
 def check_readable(path: Path) -> int:

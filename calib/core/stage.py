@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVarTuple
 
-from calib.core.errors import BadInputError, CalibError, SomeFailedError, end_of
+from calib.core.errors import BadInputError, CalibError, CopyError, SomeFailedError, end_of
 from calib.core.files import hash_of, shown
 from calib.core.options import NoOptions
 from calib.core.verdict import Finding, Verdict
 from calib.core.words import Block, described
 
 if TYPE_CHECKING:
+    from calib.core.arrays import FloatArray
     from calib.core.plot import Figure
     from calib.core.result import Result
     from calib.core.rig import Rig
@@ -74,6 +76,7 @@ class Files:
     merged : sections whose earlier values go into the outcome as they are.
     failed : by the path of a file that could not be worked on, the exit code it alone would have, and why.
     left_out : why a file that a person named cannot be used beside others, by its path.
+    beginnings : first readings of the logs that were read, by name and column.
     """
 
     paths: tuple[Path, ...] = ()
@@ -87,6 +90,7 @@ class Files:
     merged: tuple[str, ...] = ()
     failed: dict[Path, tuple[int, str]] = field(default_factory=dict)
     left_out: dict[Path, BadInputError] = field(default_factory=dict)
+    beginnings: dict[str, Mapping[str, FloatArray]] = field(default_factory=dict)
     figures: bool = True
     keep: bool = True
     named: tuple[Path, ...] = field(init=False)
@@ -123,8 +127,8 @@ class Files:
     def leave_out(self, error: BadInputError) -> bool:
         """Whether the work can begin anew without the one file that a sentence begins with.
 
-        It cannot where that leaves less than half of the files, and for a name that leads nowhere, which a
-        person has mistyped.
+        It cannot where that leaves less than half of the files, copies not counted, and for a name that leads
+        nowhere, which a person has mistyped.
         """
         said, starts = str(error), (": ", ", line ")
         named = [
@@ -136,27 +140,60 @@ class Files:
                 for then in starts
             )
         ]
-        many = 2 * (len(self.left_out) + 1) > len(self.named)
+        spoilt, whole = _without_copies([*self.left_out.values(), error], self.named)
+        many = 2 * len(spoilt) > whole
         if len(named) != 1 or many or not named[0].exists():
             return False
         self.left_out[named[0]] = error
         self.paths = tuple(path for path in self.paths if path != named[0])
         self.hashes.clear()
+        self.beginnings.clear()
         self.remarks.clear()
         return True
 
-    def taken(self, path: Path) -> str:
+    def taken(self, path: Path, beginning: Mapping[str, FloatArray] | None = None) -> str:
         """Note that a file is an input; its name without folders, the same wherever the folder lies.
 
-        Raises `BadInputError` for a copy of one that is, which would count twice.
+        Parameters
+        ----------
+        beginning : of a log the first readings by column, which are the same in every format.
+
+        Raises `CopyError` for a copy of one that is.
         """
-        name, digest = shown(path.name), hash_of(path)
-        if first := next((other for other, one in self.hashes.items() if one == digest), ""):
-            raise BadInputError(f"{shown(path)}: is the same recording as {first}; leave one out")
+        name, digest, read = shown(path.name), hash_of(path), beginning or {}
+        same = (other for other, one in self.hashes.items() if one == digest)
+        alike = (other for other, one in self.beginnings.items() if _same_readings(one, read))
+        if first := next(chain(same, alike), ""):
+            raise CopyError(f"{shown(path)}: is the same recording as {first}; leave one out")
         if name in self.hashes:
             name = f"{name} ({len(self.hashes) + 1})"
         self.hashes[name] = digest
+        self.beginnings[name] = read
         return name
+
+
+_FEWEST_ALIKE, _ROUNDING = 100, 1e-6
+"""So many readings with a sensor's noise agree by no chance; what nine digits leave of them."""
+
+
+def _without_copies(errors: Iterable[BadInputError], named: Sized) -> tuple[list[BadInputError], int]:
+    """Those of the errors that lose a log, and how many logs there are without copies."""
+    errors = [*errors]
+    spoilt = [error for error in errors if not isinstance(error, CopyError)]
+    return spoilt, len(named) - (len(errors) - len(spoilt))
+
+
+def _same_readings(one: Mapping[str, FloatArray], other: Mapping[str, FloatArray]) -> bool:
+    """Whether two logs, or one and the beginning of the other, hold the same readings of the same columns."""
+    import numpy as np
+
+    pairs = [(a, other[name]) for name, a in one.items() if name in other]
+    pairs = [(a[: len(b)], b[: len(a)]) for a, b in pairs]
+    return (
+        one.keys() == other.keys()
+        and any(len(a) >= _FEWEST_ALIKE and np.ptp(a) > 0.0 for a, _ in pairs)
+        and all(np.allclose(a, b, _ROUNDING, _ROUNDING) for a, b in pairs)
+    )
 
 
 @dataclass(frozen=True)
@@ -294,12 +331,14 @@ class Stage(Generic[*Inputs]):
 
         if not files.left_out:
             return
-        whole = len(files.named)
         # What a section holds does not depend on the folder.
         said = [str(error).replace(f"{path.parent}/", "") for path, error in files.left_out.items()]
         one = len(said) == 1
-        text = f"{len(said)} of {whole} logs cannot be used and {'is' if one else 'are'} left out: "
-        many = len(said) > _MANY * whole
+        text = (
+            f"{len(said)} of {len(files.named)} logs cannot be used and {'is' if one else 'are'} left out: "
+        )
+        spoilt, whole = _without_copies(files.left_out.values(), files.named)
+        many = len(spoilt) > _MANY * whole
         finding = Finding(
             "poor" if many else "remark",
             text + "; ".join(said),
@@ -311,7 +350,8 @@ class Stage(Generic[*Inputs]):
         if not judged:
             for path, error in files.left_out.items():
                 files.narrate(str(error))
-                files.failed[path] = error.exit_code, str(error)
+                if error in spoilt:
+                    files.failed[path] = error.exit_code, str(error)
 
     def sections(self, outcome: Any) -> dict[str, Result]:
         """The sections of rig.yaml that an outcome holds, by name."""

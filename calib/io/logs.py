@@ -43,6 +43,8 @@ from calib.io.columns import (
     COLUMNS,
     GYRO,
     MEASURED,
+    POSE,
+    PRESSURES,
     TRUE,
     UNITS,
     Block,
@@ -63,6 +65,9 @@ _MOST_CELLS = 200_000_000
 _COUNTERS, _DAY_S = (1 << 16, 1 << 32), 86400
 _WRAPS_WITHIN = 20.0
 """Usual steps from the last time before a counter begins again to the first one after."""
+
+
+_BEGINNING = 1000
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,14 @@ class Log:
         if not names or any(name not in self.columns for name in names):
             return np.zeros(0, dtype=np.int64)
         return np.nonzero(np.logical_and.reduce([~np.isnan(self.columns[name]) for name in names]))[0]
+
+    @property
+    def beginning(self) -> dict[str, FloatArray]:
+        """The first readings of each sensor by column, which tell one recording from another."""
+        read = {
+            name: self.columns[name] for name in (*IMU, *_MARKER, *PRESSURES, *POSE) if name in self.columns
+        }
+        return {name: column[np.isfinite(column)][:_BEGINNING] for name, column in read.items()}
 
     def unit(self, name: str) -> str:
         """The unit in which a column stands in the file, that of its name for a log that was made up."""

@@ -191,6 +191,12 @@ def _passed_over(root: Path, flat: bool, logs: Iterable[Path], pictures: Collect
                 f"{place}/: {_names(strange)} left out, expected pictures, or where there are none {videos}"
             )
     strange = [path for path in _entries(root / "logs") if path.suffix.lower() not in (*LOGS, ".yaml")]
+    if folders := [path for path in strange if path.is_dir()]:
+        said.append(
+            f"logs/: {_names(folders)} left out, folders are not looked into; of a ROS 2 bag put "
+            "its file there"
+        )
+    strange = [path for path in strange if path not in folders]
     if strange:
         *most, last = LOGS
         said.append(

@@ -143,7 +143,8 @@ def perform(
         files.finish()
     except SomeFailedError as error:
         code = EXIT_POOR
-        messages.append(str(error))
+        why = next(words for _, words in files.failed.values())
+        messages.append(f"{error}: {why}" if len(files.failed) == 1 else str(error))
     except Exception as error:
         code, sentence = end_of(error)
         if code == EXIT_INTERNAL and os.environ.get("CALIB_DEBUG") == "1":

@@ -20,7 +20,7 @@ from outside import outside
 from calib.cli.verbs import verb
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.logs import log_text, read_log, write_log
+from calib.io.logs import Log, log_text, read_log, write_log
 from calib.stages import stage
 from calib.stages.imu.tracks import missing
 from calib.twin.rig import SimulatedRig
@@ -85,10 +85,13 @@ def test_of_several_logs_one_that_cannot_be_used_is_left_out(
     assert "spoilt.csv" not in section.inputs
     assert str(tmp_path) not in rig.read_text()
     # A copy would count twice.
-    (tmp_path / "copy.csv").write_bytes(sound[0].read_bytes())
-    ended = calib("imu", "static", *sound, tmp_path / "copy.csv", "--rig", rig)
+    copies = [tmp_path / "copy.csv", tmp_path / "copy.parquet"]
+    copies[0].write_bytes(sound[0].read_bytes())
+    Log.load(sound[1]).save(copies[1])
+    ended = calib("imu", "static", *sound, *copies, "--rig", rig)
     assert ended.code == 0
-    assert "is left out: copy.csv: is the same recording as rest0.csv" in ended.out
+    assert "(remark) 2 of 6 logs cannot be used and are left out: copy.csv: is the same reco" in ended.out
+    assert "copy.parquet: is the same recording as rest1.csv" in ended.out
     # What is found as the log is worked on, too.
     moved.write_text(HEAD + "".join(f"{k / 100},{k % 7},{k % 5},1,9,{k % 3},1\n" for k in range(2000)))
     ended = calib("imu", "static", sound[0], moved, "--rig", rig)

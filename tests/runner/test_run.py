@@ -395,6 +395,13 @@ def test_links_out_of_the_folder_are_left_out_and_named(tmp_path: Path) -> None:
     assert [log.slug for log in followed.logs] == ["linked", "one", "two", "within"]
 
 
+def test_logs_of_one_stem_have_states_of_their_own(tmp_path: Path) -> None:
+    root = make_folder(tmp_path / "rig")
+    for ending in ("tsv", "parquet", "mcap"):
+        (root / "logs" / f"one.{ending}").write_text("")
+    assert len({log.slug for log in read_folder(root).logs}) == 5
+
+
 def test_logs_of_a_bending_arm_are_told_their_verb(tmp_path: Path) -> None:
     root = make_folder(tmp_path / "rig")
     assert not read_folder(root).left_out
@@ -431,7 +438,8 @@ def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
         "swing2.csv: was",
         "images/: day1",
         "images/: board.mp4, view1.gif",
-        "logs/: swing1.txt, tag1",
+        "logs/: tag1",
+        "logs/: swing1.txt",
         "logs/: states that calib replay has written,",
     ]
     assert [log.slug for log in read.logs] == ["one", "two"]

@@ -491,7 +491,7 @@ def read_track(
     delay_s = 0.0
     if states is None and not options.truth and not len(log.sampled("u_px", "v_px")):
         states = states_beside(path)
-    files.taken(path)
+    files.taken(path, log.beginning)
     if options.truth:
         (t, head, W), how = _from_truth(log, nominal.plant.bellows_radius_m), "truth"
     elif states is not None:

@@ -56,7 +56,7 @@ def _read(
             signs |= {name: sign for name, sign in own.items() if sign != board[name]}
         files.remarks += remarks
         if log is not None:
-            logs.append(replace(log, source=files.taken(path)))
+            logs.append(replace(log, source=files.taken(path, read.beginning)))
     if not logs:
         raise BadInputError(files.remarks[-1])
     settings = settings_from_rig(rig, files.rig_path, logs, options.marker_offset_m)

@@ -99,8 +99,9 @@ def read_trials(
     used = {path.stem for path in files.paths}
     recordings = []
     for path in files.paths:
-        recordings.append(recording_of(read_log(path, options, files.remarks), path.stem))
-        files.taken(path)
+        log = read_log(path, options, files.remarks)
+        recordings.append(recording_of(log, path.stem))
+        files.taken(path, log.beginning)
     found = frame_of(recordings) if frame is None else frame
     if frame is not None:
         check_frame(recordings, frame)

@@ -29,8 +29,11 @@ def _readings(files: Files, options: LogOptions, read: Callable[[Log], Readings]
     """Readings of each log, by the name that is written, which does not depend on the folder."""
     from calib.io.logs import read_log
 
-    logs = [(path, read(read_log(path, options, files.remarks))) for path in files.paths]
-    return [replace(log, source=files.taken(path)) for path, log in logs]
+    logs = []
+    for path in files.paths:
+        log = read_log(path, options, files.remarks)
+        logs.append(replace(read(log), source=files.taken(path, log.beginning)))
+    return logs
 
 
 # ----------------------------------------------------------------------
@@ -179,9 +182,10 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> tuple[Any, ...]:
         )
     logs: list[TuneLog] = []
     for path in files.paths:
-        log = tune_log(read_log(path, options, files.remarks, rig.picture_px), how)
+        whole = read_log(path, options, files.remarks, rig.picture_px)
+        log = tune_log(whole, how)
         files.remarks += log.said
-        name = files.taken(path)
+        name = files.taken(path, whole.beginning)
         # What is written to the rig's file does not depend on the folder.
         logs.append(replace(log, source=name, pieces=tuple(replace(p, source=name) for p in log.pieces)))
         check_rate(log.sampling, shown(path), logs[0].sampling, logs[0].source)
