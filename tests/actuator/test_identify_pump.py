@@ -353,10 +353,11 @@ def _rows(n: int = 100) -> np.ndarray:
         ("t_s,pwm,pressure_kPa", "kPa"),
         ("Timestamp_s,PWM_Main,Feedback_kPa", "kPa"),
         ("t_s,pwm1,force_N", "N"),
+        ("t_s,pwm1,chamber", "kPa"),
     ],
 )
 def test_columns_are_recognised(tmp_path: Path, head: str, unit: str) -> None:
-    table = read_pump_table(_write(tmp_path / "a.csv", head, _rows()))
+    table = read_pump_table(_write(tmp_path / "a.csv", head, _rows()), value=head.rpartition(",")[2])
     assert table.unit == unit
     assert table.record is not None
     assert np.allclose(table.record.value, _rows()[:, 2], atol=1e-4)
@@ -378,6 +379,22 @@ def test_columns_in_other_units_are_refused(tmp_path: Path, scale: list[float], 
     rows = rows * scale if scale[0] else rows + scale
     with pytest.raises(BadInputError, match=rf"a\.csv: {sentence}"):
         read_pump_table(_write(tmp_path / "a.csv", "t_s,pwm,Pressure", rows))
+
+
+@pytest.mark.parametrize(
+    ("time", "pwm", "value", "sentence"),
+    [
+        ("time_ms", "pwm", "force", "time_ms is in ms by its name, expected seconds"),
+        ("t", "Duty (%)", "force", r"Duty \(%\) is in % by its name, expected 0 to 255"),
+        ("t", "pwm", "chamber_psi", "chamber_psi is in psi by its name, expected kPa or N"),
+    ],
+)
+def test_columns_named_after_other_units_are_refused(
+    tmp_path: Path, time: str, pwm: str, value: str, sentence: str
+) -> None:
+    path = _write(tmp_path / "a.csv", f"{time},{pwm},{value}", _rows())
+    with pytest.raises(BadInputError, match=rf"a\.csv: {sentence}"):
+        read_pump_table(path, time, pwm, value)
 
 
 @pytest.mark.parametrize("step", [0.0, 0.01, 0.2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +51,27 @@ _KPA = (1.0, 2000.0)
 """What the pressure of a pump is at most."""
 _AIR_KPA = (80.0, 110.0)
 """Pressure of the air, from 2000 m above the sea down to it."""
+_OTHER_UNITS = frozenset(
+    [
+        "ms",
+        "us",
+        "ns",
+        "percent",
+        "pct",
+        "%",
+        "psi",
+        "bar",
+        "mbar",
+        "pa",
+        "hpa",
+        "mpa",
+        "atm",
+        "mmhg",
+        "mn",
+        "kn",
+        "lbf",
+    ]
+)
 _MOST_BAD = 0.05
 _FEWEST = 20
 _SHORTEST_S = 0.5
@@ -92,9 +114,16 @@ def read_pump_table(
     table, kept = table[good], [k for k in range(len(rows)) if good[k]]
     t, u, y = table.T
     name = shown(path.name)
-    assumed = unit is None and header[at[2]].lower() == "pressure"
+    words = [re.findall("[a-z%]+", header[k].lower()) for k in at]
+    expected = ("seconds", "0 to 255", "kPa or N") if unit is None else ("seconds", "0 to 255")
+    for k, mine, right in zip(at, words, expected, strict=False):
+        for word in _OTHER_UNITS.intersection(mine):
+            raise BadInputError(
+                f"{shown(path)}: {header[k]} is in {word} by its name, expected {right}; convert the column"
+            )
+    assumed = unit is None and "force" not in words[2] and "kpa" not in words[2]
     if unit is None:
-        unit = "N" if header[at[2]].lower().startswith("force") else "kPa"
+        unit = "N" if "force" in words[2] else "kPa"
         if assumed:
             said.append(f"takes the column {header[at[2]]} for kPa")
     outside = np.nonzero((u < 0.0) | (u > 255.0))[0]
