@@ -864,6 +864,15 @@ def test_states_stand_in_for_pictures(folder: Path) -> None:
         _read(folder, path.name)
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_swing_begins_where_it_is_let_go_whatever_the_camera_s_rate(folder: Path, every: int) -> None:
+    log = read_log(folder / "swing.csv")
+    seen = np.isin(np.arange(len(log)), log.sampled("u_px", "v_px")[::every])
+    slow = {name: np.where(seen, log.columns[name], np.nan) for name in ("u_px", "v_px")}
+    start = _read(folder, _changed(folder, "swing.csv", **slow).name).start
+    assert start.phi_rad == pytest.approx(log.columns["true_phi_rad"][0], abs=0.1)
+
+
 PLANT = Plant()
 
 

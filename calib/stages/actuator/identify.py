@@ -251,6 +251,7 @@ class Track:
     moving : a guess of the start where the log begins in motion, None where it begins at rest.
     source : where the pose comes from: "pictures", "states" or "truth". delay_s : what is known of its delay.
     begin_s : time of the log at which the track begins.
+    phi_rad : the angle there, where more than the first rows tell it.
     """
 
     name: str
@@ -264,6 +265,7 @@ class Track:
     source: str = ""
     delay_s: float = 0.0
     begin_s: float = 0.0
+    phi_rad: float | None = None
 
     def __post_init__(self) -> None:
         m = len(self.t_s)
@@ -278,7 +280,7 @@ class Track:
         if self.moving is not None:
             return self.moving
         phi, length = np.median(self.head[:5], axis=0).tolist()
-        return Start(phi, length)
+        return Start(phi if self.phi_rad is None else self.phi_rad, length)
 
     @property
     def unknown(self) -> tuple[str, ...]:

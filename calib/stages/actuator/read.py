@@ -553,7 +553,7 @@ def read_track(
     # What a picture shows was so one delay earlier.
     seen_s = t - delay_s
     known = seen_s >= 0.0
-    moving = start_in_motion(seen_s[known], head[known], hoses, nominal.plant, noise)
+    moving, phi = start_in_motion(seen_s[known], head[known], hoses, nominal.plant, noise), None
     if moving is not None:
         said.append(
             f"{log.source}: begins in motion ({moving.phi_rad:.3f} rad, {moving.dphi_radps:+.2f} rad/s); its "
@@ -562,7 +562,10 @@ def read_track(
         # The first pictures show the head before the first tick.
         late = t >= delay_s + _LATE_S
         t, head, W = t[late], head[late], W[late]
-    return Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving, how, delay_s, begin)
+    elif not hoses and np.count_nonzero(known) >= _IDENTIFYSTART_FEWEST:
+        # Five pictures of a slow camera are more than half of a swing.
+        phi = swing_at_beginning(seen_s[known], head[known, 0])[0]
+    return Track(shown(path.name), tick_s, pwm, hoses, t, head, W, moving, how, delay_s, begin, phi)
 
 
 _MOST_M = 1.0
