@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x6C75D580UL
+#define CALIB_ID 0x6BA56523UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -235,12 +235,12 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.50148654f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000253142265f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.8749647e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000253142294f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.87496515e-06f /* row 1, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_1 -4.20656443e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.77445235e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_21 -5.7744528e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000257548585f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.74415163e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_2 -1.74415181e-05f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00250804378f /* K_a, share of the accelerometer's residual */
 #define CALIB_FUSED_ACCEL_WEAK 0.000255661958f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.0081933625f /* dt / 2 over the gyroscope's scale, s */
@@ -312,9 +312,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.206894f, 139.688278f, 149.110947f, 157.536301f, 165.439468f,
-    173.068909f, 180.588776f, 188.158401f, 195.94632f, 204.162292f, 213.161575f,
-    223.748413f, 240.518951f, 253.5f,
+    99.75f, 128.206848f, 139.688217f, 149.11087f, 157.536209f, 165.439346f,
+    173.068787f, 180.588623f, 188.158234f, 195.946136f, 204.162064f, 213.161301f,
+    223.748032f, 240.517807f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
