@@ -172,8 +172,12 @@ def _control(folder: Folder, job: Job) -> Job:
 
 def _replay(_: Folder, job: Job) -> Job:
     log = job.log
-    usable = log is not None and (log.has(*_CAMERA) or log.has(*_IMU))
-    return job.reading((log.path,) if log and usable else (), "the log has neither a camera nor an IMU")
+    if log is None or not (log.has(*_CAMERA) or log.has(*_IMU)):
+        return job.skipped("the log has neither a camera nor an IMU")
+    if log.kind != "motion" and not log.has(*_CAMERA):
+        # Of an IMU alone, at rest or turned by hand, nobody wants the states of an actuator.
+        return job.skipped("an IMU without motion and without pictures")
+    return job.reading((log.path,), "")
 
 
 _OPTICS = ("camera", "plane")

@@ -478,6 +478,17 @@ def test_of_the_plane_one_video_is_read(tmp_path: Path) -> None:
     )
 
 
+def test_states_are_those_of_motion_or_of_pictures(tmp_path: Path) -> None:
+    logs = make_folder(tmp_path / "rig") / "logs"
+    imu = "t_s,ax_mps2,ay_mps2,gz_radps\n0,1,2,3\n"
+    for name in ("static1", "poses", "swing"):
+        (logs / f"{name}.csv").write_text(imu)
+    (logs / "static2.csv").write_text("t_s,u_px,v_px\n0,1,2\n")
+    jobs = [job for job in jobs_of(read_folder(tmp_path / "rig")) if job.step.name == "replay"]
+    skipped = [job.name for job in jobs if job.status == "skipped"]
+    assert len(jobs) == 6 and skipped == ["replay-poses", "replay-static1"]
+
+
 def test_every_stage_comes_after_what_it_reads() -> None:
     written: dict[str, str] = {}
     for stage in STEPS:
