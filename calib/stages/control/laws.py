@@ -360,7 +360,7 @@ def falling_rate(model: Model, force_N: FloatArray) -> FloatArray:
         a, b = law.laminar_s, law.turbulent_s2_per_N
         # With the valve open the pump can slow this down, never speed it up.
         return np.asarray(2.0 * F / (a + np.sqrt(a * a + 4.0 * b * F)))
-    return np.minimum(np.full_like(F, law.falling_N_per_s), F / model.pump.lag_s + law.falling_N_per_s)
+    return np.full_like(F, law.falling_N_per_s)
 
 
 def least_pwm(model: Model, state: PumpEstimate, share: float) -> Pair:
@@ -743,8 +743,8 @@ def computed_torque_step(
     then = wanted.at(k + model.pump.delay_ticks + control.horizon_ticks)
     crept = model.plant.creep_rates[2] * (y[4:6] - wanted.z_N[arrives])
     # A command that is held for T makes the force lead a ramp of slope s by s (T - tau (1 - a)).
-    T, lag = control.horizon_ticks * model.tick_s, model.pump.lag_s
-    lead = lag * -math.expm1(-T / lag) / T
+    T, lags = control.horizon_ticks * model.tick_s, np.array(model.pump.lags_s)
+    lead = lags * -np.expm1(-T / lags) / T
     ramp = wanted.force_N[then] - wanted.force_N[arrives]
     force = wanted.force_N[arrives] + lead * ramp - crept - observer.d_N
     if control.Kp_per_s2 or control.Kd_per_s:

@@ -132,8 +132,9 @@ def rig_system(model: laws.Model, q_m: FloatArray) -> System:
     A, B = np.zeros((8, 8)), np.zeros((8, 2))
     A[:6, :6] = linearised(plant, q)
     A[2:4, 6:] = np.linalg.inv(mass_matrix(plant, q))
-    A[6:, 6:] = -np.eye(2) / model.pump.lag_s
-    B[6:] = np.diag(pump_slope(model, q)) / model.pump.lag_s
+    per_s = 1.0 / np.array(model.pump.lags_s)
+    A[6:, 6:] = -np.diag(per_s)
+    B[6:] = np.diag(per_s * pump_slope(model, q))
     block = np.zeros((10, 10))
     block[:8, :8], block[:8, 8:] = A, B
     held = expm(h * block)
@@ -331,12 +332,13 @@ def largest_angle(model: laws.Model, pump: int = 0) -> float:
 
 
 _ALIKE = 0.01
-"""Between the pumps' strengths: less moves a margin by less than rounding the gains does (`_slack`)."""
+"""Between the pumps' strengths or lags: less moves a margin by less than rounding gains does (`_slack`)."""
 
 
 def unlike(model: laws.Model) -> bool:
     """Whether the pumps differ so much that each side counts by itself."""
-    return abs(math.log(model.strength[1] / model.strength[0])) > _ALIKE
+    ratios = model.strength[1] / model.strength[0], model.pump.lag_ratio
+    return any(abs(math.log(ratio)) > _ALIKE for ratio in ratios)
 
 
 def approach_s(model: laws.Model, q_m: FloatArray) -> float:
@@ -345,7 +347,8 @@ def approach_s(model: laws.Model, q_m: FloatArray) -> float:
     share = F / laws.largest_force_N(model)
     if np.any(share >= 1.0):
         return math.inf
-    return float(np.max(-model.pump.lag_s * np.log1p(-share))) + model.pump.delay_ticks * model.tick_s
+    filled_s = -np.array(model.pump.lags_s) * np.log1p(-share)
+    return float(filled_s.max()) + model.pump.delay_ticks * model.tick_s
 
 
 @dataclass(frozen=True)
@@ -381,7 +384,7 @@ class Following:
 
 def _nearest(model: laws.Model, wanted: FloatArray) -> FloatArray:
     h, most = model.tick_s, laws.largest_force_N(model)
-    a = math.exp(-h / model.pump.lag_s)
+    a = np.exp(-h / np.array(model.pump.lags_s))
     given = np.empty_like(wanted)
     given[0] = np.clip(wanted[0], 0.0, most)
     for k in range(1, len(wanted)):
@@ -473,7 +476,7 @@ def _least_times(model: laws.Model, points: FloatArray) -> FloatArray:
     F = np.maximum(laws.holding_force(model.plant, points), 0.0)
     most = laws.largest_force_N(model)
     dF, middle = np.diff(F, axis=0), 0.5 * (F[1:] + F[:-1])
-    up = model.pump.lag_s * dF / np.maximum(most - middle, 1e-3 * most)
+    up = np.array(model.pump.lags_s) * dF / np.maximum(most - middle, 1e-3 * most)
     down = -dF / np.maximum(laws.falling_rate(model, middle), 1e-9)
     return np.asarray(np.max(np.maximum(up, down), axis=1))
 
