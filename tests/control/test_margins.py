@@ -129,8 +129,8 @@ def test_an_integrator_has_the_margins_of_the_book(k: float) -> None:
     assert found.delay_s == pytest.approx((0.5 * math.pi - half) / (2.0 * half / H), rel=2e-2)
 
 
-def gain_to_instability(loop: System, channel: int = 0, most: float = 1e4) -> float:
-    """Gain margin by brute force: the factor on a channel at which an eigenvalue leaves the unit circle.
+def gain_to_instability(loop: System, channel: int | slice = 0, most: float = 1e4) -> float:
+    """Gain margin by brute force: the factor on channels at which an eigenvalue leaves the unit circle.
 
     Bisection after the first of growing factors that is unstable; infinite when none up to `most` is.
     """
@@ -185,14 +185,19 @@ def test_the_gain_margin_by_brute_force(model: object, phi: float, gains: tuple[
     ],
 )
 @pytest.mark.parametrize("sensing", [False, True])
-def test_each_channel_of_the_position_loop_by_brute_force(q: tuple[float, float], sensing: bool) -> None:
+def test_each_channel_of_the_lengths_and_both_by_brute_force(q: tuple[float, float], sensing: bool) -> None:
     pid = Pid(18000.0, 0.0, 180.0)
     loop = position_loop(NOMINAL, pid, q)
     if not sensing:
         loop = series(both_channels(pid), rig_system(NOMINAL, np.array(q)))
-    for i, found in enumerate(loop_margins(loop)):
+    *each, one, other = loop_margins(loop)
+    for i, found in enumerate(each):
         assert found.stable
         assert found.gain == pytest.approx(gain_to_instability(loop, i), rel=1e-3)
+    # The pumps share a supply: less of it is left than of each.
+    both = gain_to_instability(loop, slice(None))
+    assert min(one.gain, other.gain) == pytest.approx(both, rel=1e-3)
+    assert both - 1.0 < 0.7 * (min(m.gain for m in each) - 1.0)
 
 
 def test_the_delay_margin_by_brute_force() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise, permutations
 
 import numpy as np
 
@@ -171,7 +172,11 @@ def firmware_sensing(model: laws.Model) -> System:
 #
 #     L_i = L_ii - L_io (I + L_oo)^-1 L_oi,
 #
-# o the others. Its margins are read off the frequency response between zero and half the sampling rate:
+# o the others. What acts on all channels alike, as the supply of both pumps or softer springs, is another
+# matter: with a factor s on all of them det(I + s L) is the product of 1 + s l over the eigenvalues l of L,
+# so that each of these loci is a scalar loop as well (MacFarlane and Postlethwaite 1977). At the nominal
+# rests 54 % more of both pumps are as much as 109 % more of one. Margins are read off the frequency response
+# between zero and half the sampling rate:
 #
 #     gain margin    least factor, above or below 1, at which L passes -1: 1 / |L| where L is real and
 # negative
@@ -250,12 +255,28 @@ def break_at(L: ComplexArray, channel: int) -> ComplexArray:
     return np.asarray(own - (L[:, channel, None][:, :, others] @ rest)[:, 0, 0], dtype=np.complex128)
 
 
+def loci(L: ComplexArray) -> ComplexArray:
+    """Eigenvalues (k, n) of a loop (k, n, n), each followed from frequency to frequency; none of n = 1."""
+    if L.shape[1] == 1:
+        return L[:, 0, :0]
+    found = np.linalg.eigvals(L)
+    orders = [list(order) for order in permutations(range(L.shape[1]))]
+    for before, now in pairwise(found):
+        now[:] = now[min(orders, key=lambda order: float(np.abs(now[order] - before).sum()))]
+    return np.asarray(found, dtype=np.complex128)
+
+
+def scalar_loops(L: ComplexArray, together: ComplexArray) -> list[ComplexArray]:
+    """The loops (k,) that have to keep margins: each channel of L (k, n, n), then its `loci`."""
+    return [*(break_at(L, i) for i in range(L.shape[1])), *together.T]
+
+
 def loop_margins(loop: System) -> list[Margins]:
-    """Margins of each channel of a square loop, negative feedback."""
+    """Margins of each channel of a square loop, negative feedback, then those of all channels together."""
     w = frequencies(loop.tick_s)
     L = response(loop, w)
     stable = spectral_radius(closed_loop(loop)) < 1.0
-    return [margins_of_response(w, break_at(L, i), stable) for i in range(len(loop.D))]
+    return [margins_of_response(w, one, stable) for one in scalar_loops(L, loci(L))]
 
 
 # ----------------------------------------------------------------------
@@ -656,7 +677,7 @@ _BISECTIONS = 16
 
 @dataclass(frozen=True)
 class Point:
-    """Margins at an operating point, the least of its channels."""
+    """Margins at an operating point, the least of its channels and of all together."""
 
     q_m: tuple[float, float]
     margins: Margins
@@ -744,19 +765,22 @@ def _worst(margins: Sequence[Margins]) -> Margins:
 def _strongest(
     criterion: ControllerCriterion,
     shape: ComplexArray,
-    rigs: Sequence[ComplexArray],
+    rigs: Sequence[tuple[ComplexArray, ComplexArray]],
     omega: FloatArray,
     most: float,
 ) -> float:
-    """Largest factor on a controller's response (k,) that keeps the margins at rigs (k, n, n); 0 if none."""
+    """Largest factor on a controller's response (k,) that keeps the margins at rigs; 0 if none.
+
+    `rigs` are responses (k, n, n), each with its loci (k, n).
+    """
 
     def good(factor: float) -> bool:
-        for rig in rigs:
-            L = factor * shape[:, None, None] * rig
-            for i in range(L.shape[1]):
-                if not holds(criterion, margins_of_response(omega, break_at(L, i), True)):
-                    return False
-        return True
+        C = factor * shape
+        return all(
+            holds(criterion, margins_of_response(omega, one, True))
+            for rig, together in rigs
+            for one in scalar_loops(C[:, None, None] * rig, C[:, None] * together)
+        )
 
     low, high = 1e-3 * most, most
     if not good(low):
@@ -786,7 +810,7 @@ def _searched(
     merit: Callable[[laws.Pid], float],
 ) -> Tuned:
     omega = frequencies(model.tick_s, 400)
-    seen = [response(rig, omega) for rig in rigs]
+    seen = [(L, loci(L)) for L in (response(rig, omega) for rig in rigs)]
     best: list[laws.Pid] = []
     for Ti in integrals_s:
         for Td in _DERIVATIVE_S.tolist():

@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x6BA56523UL
+#define CALIB_ID 0x7A6D658FUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -270,11 +270,11 @@
 /*
  * Control of the angle, PID (4.1), (4.4).
  * falling_share is left out: the lower limit is CALIB_PUMP_LOW_PWM.
- * Kp = 440, Ki = 980, Kd = 4.4, error in rad. The pipeline sums (4.4) up:
+ * Kp = 440, Ki = 980, Kd = 8.8, error in rad. The pipeline sums (4.4) up:
  * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k.
  */
-#define CALIB_ORIENTATION_KPDI_PWM_PER_RAD 712.166687f /* Kp + Kd / dt + Ki dt / 2, PWM/rad */
-#define CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD 264.0f /* Kd / dt, PWM/rad */
+#define CALIB_ORIENTATION_KPDI_PWM_PER_RAD 976.166687f /* Kp + Kd / dt + Ki dt / 2, PWM/rad */
+#define CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD 528.0f /* Kd / dt, PWM/rad */
 #define CALIB_ORIENTATION_KI_HALF_DT_PWM_PER_RAD 8.16666698f /* Ki dt / 2, PWM/rad */
 #define CALIB_ORIENTATION_HAS_KI 1 /* for #if */
 #define CALIB_ORIENTATION_CLAMPING 0 /* 1: no integration beyond the limits (4.1.1) */
@@ -286,11 +286,11 @@
 
 /*
  * Control of both lengths, PD (4.5), (4.8).
- * Kp = 18000, Ki = 0, Kd = 360, error in m. The pipeline sums (4.4) up:
+ * Kp = 14000, Ki = 0, Kd = 280, error in m. The pipeline sums (4.4) up:
  * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k.
  */
-#define CALIB_POSITION_KPDI_PWM_PER_M 39600.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
-#define CALIB_POSITION_KD_PER_DT_PWM_PER_M 21600.0f /* Kd / dt, PWM/m */
+#define CALIB_POSITION_KPDI_PWM_PER_M 30800.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
+#define CALIB_POSITION_KD_PER_DT_PWM_PER_M 16800.0f /* Kd / dt, PWM/m */
 #define CALIB_POSITION_KI_HALF_DT_PWM_PER_M 0.0f /* Ki dt / 2, PWM/m */
 #define CALIB_POSITION_HAS_KI 0 /* for #if */
 #define CALIB_POSITION_CLAMPING 0 /* 1: no integration beyond the limits (4.1.1) */

@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xF74E1A22UL
+#define CALIB_ID 0xC5BD785DUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -288,10 +288,10 @@
 
 /*
  * Control of both lengths, PD (4.5), (4.8).
- * Kp = 16000, Ki = 0, Kd = 0, error in m. The pipeline sums (4.4) up:
+ * Kp = 12000, Ki = 0, Kd = 0, error in m. The pipeline sums (4.4) up:
  * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k.
  */
-#define CALIB_POSITION_KPDI_PWM_PER_M 16000.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
+#define CALIB_POSITION_KPDI_PWM_PER_M 12000.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
 #define CALIB_POSITION_KD_PER_DT_PWM_PER_M 0.0f /* Kd / dt, PWM/m */
 #define CALIB_POSITION_KI_HALF_DT_PWM_PER_M 0.0f /* Ki dt / 2, PWM/m */
 #define CALIB_POSITION_HAS_KI 0 /* for #if */

@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x9C818409UL
+#define CALIB_ID 0xDAAAD2C7UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -286,11 +286,11 @@
 
 /*
  * Control of both lengths, PD (4.5), (4.8).
- * Kp = 18000, Ki = 0, Kd = 180, error in m. The pipeline sums (4.4) up:
+ * Kp = 13000, Ki = 0, Kd = 0, error in m. The pipeline sums (4.4) up:
  * u = KPDI e_k + (P - KD_PER_DT e_(k-1)), P += 2 KI_HALF_DT e_k.
  */
-#define CALIB_POSITION_KPDI_PWM_PER_M 28800.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
-#define CALIB_POSITION_KD_PER_DT_PWM_PER_M 10800.0f /* Kd / dt, PWM/m */
+#define CALIB_POSITION_KPDI_PWM_PER_M 13000.0f /* Kp + Kd / dt + Ki dt / 2, PWM/m */
+#define CALIB_POSITION_KD_PER_DT_PWM_PER_M 0.0f /* Kd / dt, PWM/m */
 #define CALIB_POSITION_KI_HALF_DT_PWM_PER_M 0.0f /* Ki dt / 2, PWM/m */
 #define CALIB_POSITION_HAS_KI 0 /* for #if */
 #define CALIB_POSITION_CLAMPING 0 /* 1: no integration beyond the limits (4.1.1) */
