@@ -38,7 +38,7 @@ from calib.core.writing import make_folder
 from calib.io.tables import read_cells
 from calib.runner.cache import key_of, program
 from calib.runner.folder import LOGS, Folder, folder_digests, read_folder
-from calib.runner.graph import STEPS, Runner, opened_run
+from calib.runner.graph import STEPS, Job, Runner, opened_run
 from calib.runner.outcomes import (
     LIMIT_S,
     SAME,
@@ -497,6 +497,13 @@ def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answ
     return replace(answer, outcome=answer.outcome.model_copy(update=spent))
 
 
+def reasons_of(ended: Sequence[Job]) -> tuple[str, ...]:
+    """Why stages are not ok, first of those that have failed: the rig has no result for these."""
+    weak = [job for job in ended if job.status not in ("ok", "skipped")]
+    weak.sort(key=lambda job: job.status != "failed")
+    return tuple(f"{job.step.title}: {job.reason}" for job in weak)
+
+
 def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -> Answer:
     root = local_folder(spec.source, place / "fetched", allowed=options.allowed)
     folder = read_folder(root)
@@ -519,9 +526,7 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
     finally:
         cv2.setNumThreads(threads)
     files, code = _kept(done.out, done.files, options.pages), _code(done, kind)
-    reasons = tuple(
-        f"{job.step.title}: {job.reason}" for job in done.ended if job.status not in ("ok", "skipped")
-    )
+    reasons = reasons_of(done.ended)
     decision = done.decision
     if kind == "run" and decision.lacking and not decision.failed:
         reasons = (decision.lacking, *reasons)

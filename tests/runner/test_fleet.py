@@ -31,11 +31,13 @@ from calib.runner.fleet import (
     is_url,
     kind_of,
     read_manifest,
+    reasons_of,
     run_fleet,
     run_stages,
     without_secrets,
 )
 from calib.runner.folder import read_folder
+from calib.runner.graph import STEPS, Job
 from calib.runner.outcomes import Answer, Outcome, Store, column, opened_store, texts
 from calib.runner.processes import Here
 from calib.stages.camera.section import Camera, Distortion
@@ -60,6 +62,12 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(tmp_path: Path) -> No
         (tmp_path / "rig1" / "images" / "a.png").write_bytes(b"another")
         again = run_fleet(store, Here(), manifest, FleetOptions())
         assert again == {"same": 4, "failed": 2}
+
+
+def test_a_rig_that_failed_says_first_what_has_failed() -> None:
+    ends = zip(STEPS, ("poor", "skipped", "failed", "ok", "blocked"), strict=False)
+    ended = [Job(step.name, step, status=status, reason=status) for step, status in ends]
+    assert [one.rpartition(": ")[2] for one in reasons_of(ended)] == ["failed", "poor", "blocked"]
 
 
 class _Failing(Here):
