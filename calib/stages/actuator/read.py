@@ -378,8 +378,9 @@ def _from_states(path: Path) -> Head:
     good = np.isfinite(table).all(axis=1) & np.isfinite(spread) & (spread > 0.0) & (table[:, 3] > 0.0)
     # States come at every row of camera and IMU; more than one per tick says the same again.
     table, spread = table[good], spread[good]
-    tick = np.floor((table[:, 0] - table[0, 0]) / TICK_S) if len(table) else np.zeros(0)
-    first = np.concatenate([[True], np.diff(tick) > 0.0]) if len(table) else np.zeros(0, dtype=bool)
+    # Stamps of whole microseconds are a hair beside the ticks.
+    tick = np.floor((table[:, 0] - table[:1, 0]) / TICK_S + 0.01)
+    first = np.diff(tick, prepend=-1.0) > 0.0
     table, spread = table[first], spread[first]
     W = np.zeros((len(table), 2, 2))
     W[:, 0, 0], W[:, 1, 1] = 1.0 / table[:, 3], 1.0 / spread
