@@ -634,9 +634,11 @@ def test_interpolated_heads_agree_with_fine_steps(kind: str) -> None:
 
 
 def test_experiments_shrink_and_rest_does_not() -> None:
+    """The camera's offset hides the length at rest in all logs alike, and its prior counts once."""
     tracks = [track("free", phi_rad=p, seed=k) for k, p in enumerate((0.5, -0.4))]
-    found = fit_tracks(Machine(), tracks, stated={"rest_length_m": 0.0})
+    found = fit_tracks(Machine(), tracks, stated=dict.fromkeys(("inertia_kgm2", "stiffness_scale"), 0.0))
     known = uncertainty(found)
+    assert "rest_length_m" in found.values
     ahead = {p.name: p for p in prospects(found, known)}
     for name, value in found.values.items():
         now = known.sigma[name] / abs(value)
@@ -744,6 +746,15 @@ def _changed(folder: Path, name: str, **columns: np.ndarray | None) -> Path:
     path = folder / f"changed_{name}"
     write_log(path, replace(log, columns=kept))
     return path
+
+
+def test_states_at_each_tick_are_taken_whole(folder: Path) -> None:
+    """Of stamps in whole microseconds every third was taken for a second one of its tick."""
+    t = np.arange(240) / 60.0
+    rows = [f"{s:.6f},{0.3 * math.cos(25.0 * s):.6f},0.065,0.004" for s in t.tolist()]
+    states = folder / "swing_states.csv"
+    states.write_text("\n".join(["t_s,phi_rad,length_m,sigma_phi_rad", *rows]) + "\n")
+    assert len(_read(folder, "swing.csv", states=states).t_s) >= 236
 
 
 @pytest.mark.parametrize("least", [0, 70])

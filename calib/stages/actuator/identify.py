@@ -723,8 +723,11 @@ def solve(problem: Problem, x: FloatArray, most: int = 30, enough: float = -math
     return end, float(_robust(problem, residual)), residual, J
 
 
-def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatArray) -> FloatArray:
-    """Information (P, P) about relative changes of the parameters, the other unknowns eliminated."""
+def informative(
+    problem: Problem, residual: FloatArray, J: FloatArray, x: FloatArray, shared: Sequence[int] = ()
+) -> FloatArray:
+    """Information (P + s, P + s) about relative changes of the parameters, and about the s unknowns that are
+    `shared` with other logs; all others are eliminated."""
     P = len(problem.names)
     # Relative changes of magnitudes, so that a product of a positive and a negative one is seen as such.
     size = np.copysign(np.maximum(np.abs(x[:P]), 0.1 * problem.unknowns.scale[:P]), x[:P])
@@ -732,9 +735,15 @@ def informative(problem: Problem, residual: FloatArray, J: FloatArray, x: FloatA
     w = np.ones(len(residual)) if far else weights(problem, residual)
     A = J * np.sqrt(w)[:, None]
     A[:, :P] *= size
-    H = A.T @ A
-    inverse = scaled_inverse(H[P:, P:], 1e-12)
-    return np.asarray(H[:P, :P] - H[:P, P:] @ inverse @ H[P:, :P])
+    kept = [*range(P), *shared]
+    return _eliminated(A.T @ A, kept, 1e-12)
+
+
+def _eliminated(H: FloatArray, kept: list[int], floor: float) -> FloatArray:
+    """Information about the unknowns that are kept, of that (n, n) about all."""
+    gone = [k for k in range(len(H)) if k not in kept]
+    own, mixed, rest = H[np.ix_(kept, kept)], H[np.ix_(kept, gone)], H[np.ix_(gone, gone)]
+    return np.asarray(own - mixed @ scaled_inverse(rest, floor) @ mixed.T)
 
 
 def _left_out(
@@ -1633,9 +1642,10 @@ def fit_stiffness(name: str, elongation_m: FloatArray, force_N: FloatArray) -> t
 # ----------------------------------------------------------------------
 # Which experiment to do next: the one that would shrink the worst standard deviation most.
 #
-# Experiments add their information: S_after = S_now + S_experiment, each with its own start, delay and
-# offsets eliminated. That of an experiment that was not done yet is that of a simulated one on the
-# identified rig, with a picture at each tick and the noise of the logs at hand.
+# Experiments add their information: S_after = S_now + S_experiment, each with its own start eliminated. What
+# they share with the logs at hand, the offset of the camera's plane and, with commands, the delay, is among
+# the unknowns, so that its prior counts once. The information of an experiment that was not done yet is that
+# of a simulated one on the identified rig, with a picture at each tick and the noise of the logs at hand.
 
 _TYPICAL = (0.004, 0.0004)
 
@@ -1678,9 +1688,10 @@ def _experiments(rest_length_m: float, tick_s: float) -> Iterator[Experiment]:
 def _information(
     problem: Problem, names: tuple[str, ...], values: Mapping[str, float], one: Experiment, noise: FloatArray
 ) -> FloatArray | None:
-    """Information (P, P) about relative changes from one experiment; None where it leaves the model.
+    """Information (P + 3, P + 3) about relative changes and what logs share, from one experiment.
 
-    What the experiment brings in that is not asked for, as the pumps' strength, is eliminated.
+    None where it leaves the model. What the experiment brings in that is not asked for, as the pumps'
+    strength, is eliminated.
     """
     tick_s = problem.nominal.pump.tick_s
     n = len(one.pwm)
@@ -1704,13 +1715,41 @@ def _information(
     x = first_guess(alone, values)
     x[alone.unknowns.starts[0]] = one.start.phi_rad, one.start.length_m
     residual, J = jacobian(alone, x)
-    S = informative(alone, np.zeros_like(residual), J, x)
-    P = len(names)
-    if not more:
-        return S
-    return np.asarray(
-        S[:P, :P] - S[:P, P:] @ np.linalg.pinv(S[P:, P:], rcond=1e-10, hermitian=True) @ S[P:, :P]
-    )
+    shared = _shared(alone)
+    J[alone.spans[-1].stop :, shared] = 0.0
+    S = informative(alone, np.zeros_like(residual), J, x, shared)
+    P, m = len(names), len(more)
+    out = np.zeros((P + _SHARED, P + _SHARED))
+    some = P + len(shared)
+    out[:some, :some] = _eliminated(S, [*range(P), *range(P + m, len(S))], 1e-10)
+    return out
+
+
+_SHARED = 3
+
+
+def _shared(problem: Problem) -> list[int]:
+    """Unknowns that logs share: the offset of the camera's plane, and the delay of those with commands."""
+    at = problem.unknowns
+    delays = [delay for delay, one in zip(at.delays, problem.tracks, strict=True) if one.hoses]
+    return [at.offset.start, at.offset.start + 1, *delays[:1]]
+
+
+def _at_hand(solution: Solution, known: Uncertainty, size: FloatArray) -> FloatArray:
+    """Information (P + 3, P + 3) of the logs at hand, as `_information`: of the parameters that of `known`,
+    and what they tell of the rest as white residuals do."""
+    problem, P = solution.problem, len(solution.problem.names)
+    J = solution.J.copy()
+    J[: problem.spans[-1].stop] /= known.scale
+    shared = _shared(problem)
+    S = informative(problem, solution.residual, J, solution.x, shared)
+    mixed, rest = S[:P, P:], S[P:, P:]
+    out = np.diag([0.0] * P + [_DELAY_SIGMA_S**-2] * _SHARED)
+    out[P : len(S), P : len(S)] = rest
+    out[:P, P : len(S)], out[P : len(S), :P] = mixed, mixed.T
+    alone = np.linalg.pinv(known.covariance / np.outer(size, size), hermitian=True)
+    out[:P, :P] = alone + mixed @ np.linalg.solve(rest, mixed.T)
+    return out
 
 
 def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
@@ -1724,10 +1763,10 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
     vague = [n for n, why in solution.fixed.items() if n != "lambda3" and NO_CREEP not in why]
     order = list(PARAMETERS)
     names = tuple(sorted([*problem.names, *vague], key=order.index))
-    now = np.zeros((len(names), len(names)))
-    at = [names.index(name) for name in problem.names]
+    now = np.zeros((len(names) + _SHARED, len(names) + _SHARED))
+    at = [names.index(name) for name in problem.names] + [len(names) + k for k in range(_SHARED)]
     size = np.array([max(abs(values[n]), 0.1 * PARAMETERS[n].scale) for n in problem.names])
-    now[np.ix_(at, at)] = np.linalg.pinv(known.covariance / np.outer(size, size), hermitian=True)
+    now[np.ix_(at, at)] = _at_hand(solution, known, size)
     W = np.concatenate([track.whitening for track in problem.tracks])
     inverse = np.linalg.inv(W)
     noise = known.scale * np.sqrt(np.median(np.sum(inverse**2, axis=2), axis=0))
@@ -1749,7 +1788,7 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
 def _relative(S: FloatArray, names: Sequence[str]) -> dict[str, float]:
     """Relative standard deviations of an information matrix; those that nothing bounds count as 10."""
     prior = 1e-2 * np.eye(len(S))
-    sigma = np.sqrt(np.diag(np.linalg.inv(S + prior)))
+    sigma = np.sqrt(np.diag(np.linalg.inv(S + prior)))[: len(names)]
     return {
         name: min(float(s), 10.0) if math.isfinite(s) else 10.0 for name, s in zip(names, sigma, strict=True)
     }
