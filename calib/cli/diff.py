@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calib.cli.common import JsonOption, document, narrate, say, say_table
-from calib.core.words import number
+from calib.core.words import number, several
 
 if TYPE_CHECKING:
     from calib.core.diff import Change, RigDiff
@@ -73,7 +73,7 @@ def _tell(found: RigDiff, every: bool) -> None:
         ("learnt from other inputs", found.other_inputs),
     ):
         if names:
-            say(f"{words}: {', '.join(names)}")
+            say(f"{words}: {several(names, len(names) if every else _SHOWN)}")
     for one in found.verdicts:
         say("verdict of {section}: {before} before, {after} after".format(**one))
     plane = found.plane

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ import typer
 
 from calib.cli.diff import diff
 from calib.cli.doctor import doctor
+from calib.core.rig import Rig
 from calib.runner.doctor import Check
 
 VERBS = ("intrinsics", "extrinsics", "distortion", "firmware", "board", "export", "import")
@@ -366,6 +368,19 @@ def test_table_and_document(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     told = json.loads(capsys.readouterr().out)
     assert told["significant"] is False and told["plane"] is None and told["pictures_px"] is None
     assert told["changes"][0]["sigmas"] == pytest.approx(0.1 / (0.03 * 2**0.5))
+
+
+def test_what_one_side_has_is_counted_beyond_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a = tmp_path / "a.yaml"
+    a.write_text(RIG.format(fx=273.4))
+    found = replace(Rig.load(a).diff(Rig.load(a)), only_after=tuple(f"s{k}" for k in range(30)))
+    monkeypatch.setattr(Rig, "diff", lambda one, other: found)
+    for every, end in ((False, "s19 and 10 more"), (True, "s28, s29")):
+        diff(a, a, every=every)
+        line = next(one for one in capsys.readouterr().out.splitlines() if one.startswith("only after"))
+        assert line.endswith(end)
 
 
 @pytest.mark.parametrize("bar", ["0.03", "null"])
