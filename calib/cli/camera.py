@@ -11,7 +11,7 @@ import typer
 from calib.cli.common import JsonOption, RigOption, answer, document, emit, narrate, say
 from calib.core.command import note_inputs
 from calib.core.errors import BadInputError, UsageError
-from calib.core.files import as_text, one_line, read_bytes, read_yaml_mapping, sha256, shown
+from calib.core.files import as_text, is_bag, one_line, read_bytes, read_yaml_mapping, sha256, shown
 from calib.core.units import parse_corners, parse_square_m
 from calib.core.writing import check_writable, write_atomically
 
@@ -161,7 +161,13 @@ def import_camera(
 
     check_writable(rig, SECTIONS)
     before = Rig.load(rig, missing_ok=True)
-    data, where = read_bytes(source, _MAX_BYTES), shown(source)
+    where = shown(source)
+    if is_bag(source):
+        raise BadInputError(
+            f"{where}: is a bag, expected a file of the camera; write its message into one: ros2 topic echo "
+            "--once TOPIC > camera_info.yaml, or in ROS 1 rostopic echo -n 1 TOPIC > camera_info.yaml"
+        )
+    data = read_bytes(source, _MAX_BYTES)
     try:
         name, section, words = _imported(from_, source, data)
     except BadInputError as error:

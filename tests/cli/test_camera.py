@@ -411,6 +411,13 @@ def test_one_camera_of_a_chain_is_taken_and_the_others_are_named(calib, rig, tmp
     assert "timeshift_cam_imu are not read" in out
 
 
+def test_of_a_bag_its_camera_info_is_asked_for(calib, tmp_path) -> None:
+    bag = tmp_path / "drive.bag"
+    bag.write_bytes(b"#ROSBAG V2.0\n\xff")
+    said = calib("import", "ros", bag, "--rig", tmp_path / "rig.yaml").sentence
+    assert "drive.bag: is a bag, expected a file of the camera" in said and "--once TOPIC" in said
+
+
 BAD = {
     "empty": b"",
     "a list": b"- 1\n",
