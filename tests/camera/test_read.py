@@ -14,7 +14,14 @@ from calib.core.errors import BadInputError
 from calib.stages.camera import read as boards
 from calib.stages.camera.model import Board
 from calib.stages.camera.options import Told
-from calib.stages.camera.read import board_of, find_boards, read_table, read_views, read_vnl
+from calib.stages.camera.read import (
+    board_of,
+    find_boards,
+    read_table,
+    read_views,
+    read_vnl,
+    refuse_recordings,
+)
 
 HEADER = "view,x_m,y_m,u_px,v_px\n"
 FOUR = "a,0,0,10,10\na,0.02,0,20,10\na,0,0.02,10,20\na,0.02,0.02,20.5,21\n"
@@ -236,6 +243,19 @@ def test_texture_as_small_as_a_stamp_is_no_board_of_a_wrong_size(shared_data: Pa
     pictures = sorted((shared_data / "opencv_left").glob("*.jpg"))
     with pytest.raises(BadInputError, match=r"no board with 8x6 .* any of 13 pictures, but one with 9x6 was"):
         find_boards(pictures, (8, 6), 0.025)
+
+
+def test_a_bag_that_is_a_folder_is_a_recording_with_its_board_beside_it(tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    bag.mkdir()
+    for name in ("metadata.yaml", "drive_0.mcap"):
+        (bag / name).write_text("")
+    (tmp_path / "board.yaml").write_text("corners: [8, 5]\n")
+    assert board_of([bag])[0].corners == [8, 5]
+    refuse_recordings(bag)
+    (bag / "metadata.yaml").unlink()
+    with pytest.raises(BadInputError, match=r"drive: holds no pictures, but drive_0\.mcap"):
+        refuse_recordings(bag)
 
 
 def test_the_board_of_several_folders(tmp_path: Path) -> None:

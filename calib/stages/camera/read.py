@@ -106,13 +106,18 @@ def known_dictionary(text: str, where: str, error: type[CalibError] = BadInputEr
     return name
 
 
+def folder_of(source: Path) -> Path:
+    """The folder whose board.yaml tells of a source: of pictures or a recording the one that they lie in."""
+    return source if source.is_dir() and not is_recording(source) else source.parent
+
+
 def board_of(sources: Sequence[Path]) -> tuple[BoardFile, dict[str, str]]:
     """What board.yaml tells of the board in these folders or single pictures, and its SHA-256.
 
     Raises `BadInputError` where two folders tell different boards.
     """
     told, hashes, where = BoardFile(), dict[str, str](), Path()
-    for folder in dict.fromkeys(source if source.is_dir() else source.parent for source in sources):
+    for folder in dict.fromkeys(folder_of(source) for source in sources):
         file = read_board_file(folder)
         if file == BoardFile():
             continue
@@ -960,8 +965,9 @@ def _of_recording(
 
 
 def refuse_recordings(folder: Path) -> None:
-    """Raise `BadInputError` for a folder that holds recordings and no pictures."""
-    inside = sorted(folder.iterdir()) if folder.is_dir() and not holds_pictures(folder) else []
+    """Raise `BadInputError` for a folder that holds recordings and no pictures, and is none itself."""
+    empty = folder.is_dir() and not is_recording(folder) and not holds_pictures(folder)
+    inside = sorted(folder.iterdir()) if empty else []
     for path in filter(is_recording, inside):
         raise BadInputError(
             f"{shown(folder)}: holds no pictures, but {shown(path.name)}; give that recording itself"

@@ -241,6 +241,7 @@ def _read_plane(
         another_square,
         board_of,
         find_boards,
+        folder_of,
         meant_folder,
         of_still,
         refuse_recordings,
@@ -256,7 +257,7 @@ def _read_plane(
     recording = read_frames(source) if is_recording(source) else None
     pictures = list_pictures([source]) if recording is None else []
     stated, board_hash = board_of([source])
-    folder = source if source.is_dir() else source.parent
+    folder = folder_of(source)
     board_file = shown(folder / BOARD_FILE)
     for key in ("corners", "square_m", "first_corner_m", "angle_rad"):
         if getattr(stated, key) is None:
