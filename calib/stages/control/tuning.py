@@ -403,6 +403,13 @@ class Following:
         return 1e3 * float(np.abs(self.missing_m).max())
 
 
+def _fallen(model: laws.Model, force_N: FloatArray) -> FloatArray:
+    """The least that forces (2,) can be a tick later, by what leaves and by the lag."""
+    h, F = model.tick_s, force_N
+    lag = F * np.exp(-h / np.array(model.pump.lags_s))
+    return np.maximum(lag, F - h * laws.falling_rate(model, F))
+
+
 def _nearest(model: laws.Model, wanted: FloatArray) -> FloatArray:
     h, most = model.tick_s, laws.largest_force_N(model)
     a = np.exp(-h / np.array(model.pump.lags_s))
@@ -410,12 +417,13 @@ def _nearest(model: laws.Model, wanted: FloatArray) -> FloatArray:
     given[0] = np.clip(wanted[0], 0.0, most)
     for k in range(1, len(wanted)):
         F = given[k - 1]
-        fall = np.maximum(F * a, F - h * laws.falling_rate(model, F))
-        given[k] = np.clip(wanted[k], np.minimum(fall, most), most + (F - most) * a)
+        given[k] = np.clip(wanted[k], np.minimum(_fallen(model, F), most), most + (F - most) * a)
     return given
 
 
-def _reason(model: laws.Model, q: FloatArray, wanted: FloatArray, k: int, missing: FloatArray) -> str:
+def _reason(
+    model: laws.Model, q: FloatArray, wanted: FloatArray, given: FloatArray, k: int, missing: FloatArray
+) -> str:
     i = int(np.argmax(np.abs(missing[k])))
     jumps = np.abs(np.diff(q[max(k - 1, 0) : k + 3], axis=0))
     if float(jumps.max()) > _JUMP_M:
@@ -431,8 +439,8 @@ def _reason(model: laws.Model, q: FloatArray, wanted: FloatArray, k: int, missin
     rate = float(wanted[k, i] - wanted[early, i]) / ((k - early) * model.tick_s) if k else 0.0
     if missing[k, i] > 0.0:
         return f"{name} would have to inflate at {rate:.3g} N/s, which its pump's lag does not allow"
-    least = float(laws.falling_rate(model, np.array(F)))
-    return f"{name} would have to deflate at {-rate:.3g} N/s, its air leaves at {least:.3g} N/s"
+    fastest = float((given[k - 1] - _fallen(model, given[k - 1]))[i]) / model.tick_s
+    return f"{name} would have to deflate at {-rate:.3g} N/s, its air leaves at {fastest:.3g} N/s"
 
 
 def follow(model: laws.Model, q_m: FloatArray) -> Following:
@@ -449,7 +457,7 @@ def follow(model: laws.Model, q_m: FloatArray) -> Following:
     return Following(
         at is None,
         None if at is None else at * h,
-        "" if at is None else _reason(model, np.asarray(q_m), wanted, at, missing),
+        "" if at is None else _reason(model, np.asarray(q_m), wanted, given, at, missing),
         missing,
         wanted,
         given,
