@@ -539,6 +539,7 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
         key=key,
         kind=kind,
         reasons=reasons,
+        left_out=folder.left_out,
         stages={job.name: job.status for job in done.ended},
         simulated=rig.simulated,
         values={f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(rig.values())},
@@ -635,11 +636,22 @@ def finish(store: Store, manifest: Manifest) -> FleetSummary:
     return summary
 
 
-# Columns: name, serial, source, kind, simulated, verdict, code, sentence, reasons, `verdict.STAGE` for each
-# stage, `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and outlier_of,
-# the constant that stands out most against the fleet. A rig without a number has a null there.
+# Columns: name, serial, source, kind, simulated, verdict, code, sentence, reasons, left_out, `verdict.STAGE`
+# for each stage, `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and
+# outlier_of, the constant that stands out most against the fleet. A rig without a number has a null there.
 
-_FIRST = ("name", "serial", "source", "kind", "simulated", "verdict", "code", "sentence", "reasons")
+_FIRST = (
+    "name",
+    "serial",
+    "source",
+    "kind",
+    "simulated",
+    "verdict",
+    "code",
+    "sentence",
+    "reasons",
+    "left_out",
+)
 _MOST_COLUMNS = 8000
 
 
@@ -663,6 +675,7 @@ def _row_of(rig: RigSpec, outcome: Outcome) -> dict[str, Any]:
         "code": outcome.code,
         "sentence": outcome.sentence,
         "reasons": "\n".join(outcome.reasons),
+        "left_out": "\n".join(outcome.left_out),
     }
     row |= {f"verdict.{stage}": status for stage, status in outcome.stages.items()}
     for name, (value, sigma) in outcome.values.items():

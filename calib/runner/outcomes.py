@@ -58,7 +58,8 @@ class Outcome(BaseModel):
     sentence : why, in one sentence; "" for "ok".
     key : of all that the result follows from, "" where that is not known.
     kind : of a rig "run" for all stages, "camera" for those of a camera.
-    reasons : of stages that are not ok. stages : outcome of each stage by its name.
+    reasons : of stages that are not ok. left_out : sentences on files that were not taken.
+    stages : outcome of each stage by its name.
     simulated : whether constants come from a simulated rig or from rendered pictures.
     values : numbers with their standard deviations by name; null for what did not happen.
     seconds, peak_MB : spent on it, and the process's largest memory meanwhile.
@@ -74,6 +75,7 @@ class Outcome(BaseModel):
     key: str = ""
     kind: str = ""
     reasons: tuple[Sentence, ...] = ()
+    left_out: tuple[Sentence, ...] = ()
     stages: dict[str, str] = {}
     simulated: bool = False
     values: Mapping[str, tuple[float | None, float | None]] = {}
@@ -186,6 +188,8 @@ def run_all(
             store.keep(answer)
         if outcome.status not in (SAME, "ok"):
             tell(f"{outcome.name}: {outcome.status} ({outcome.sentence})")
+        for sentence in outcome.left_out:
+            tell(f"{outcome.name}: {sentence}")
         progress(counts.total(), total)
     return counts
 

@@ -49,13 +49,15 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(tmp_path: Path) -> No
         images = tmp_path / f"rig{k}" / "images"
         images.mkdir(parents=True)
         (images / "a.png").write_bytes(b"no picture %d" % k)
+        (images / "day1").mkdir()
         specs.append(RigSpec(f"rig{k}", str(images.parent), str(k)))
     specs.append(RigSpec("gone", str(tmp_path / "none")))
     manifest, said = Manifest(tuple(specs), ()), list[str]()
     with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
         first = run_fleet(store, Here(), manifest, FleetOptions(), tell=said.append)
         assert first == {"failed": 6}
-        assert any(sentence.startswith("gone: failed (") for sentence in said) and len(said) == 6
+        assert any(sentence.startswith("gone: failed (") for sentence in said) and len(said) == 11
+        assert "rig0: images/: day1 left out, folders are not looked into" in said
         found = store.outcome("rig2")
         assert found is not None and found.code == 3
         # Bad input is bad input again; a folder that was not there may be there now.
