@@ -289,13 +289,17 @@ class Rig:
         return {**self.provenance.inputs, **carried}
 
     def save(self, path: Path | str, inputs: Mapping[str, Mapping[str, str]] | None = None) -> None:
-        """Replace the file atomically.
+        """Replace the file atomically. Raises `BadInputError`, as `load` where something else is there.
 
         Parameters
         ----------
         inputs : SHA-256 of each input by section and name, beside those that results carry.
         """
-        write_atomically(Path(path), self.file_text(path, inputs), SECTIONS)
+        file = Path(path)
+        if file.is_file() and file.stat().st_size:
+            # A verb has read it before; a program may name a picture.
+            Rig.load(file)
+        write_atomically(file, self.file_text(file, inputs), SECTIONS)
 
     def file_text(self, path: Path | str, inputs: Mapping[str, Mapping[str, str]] | None = None) -> str:
         """What `save` writes."""

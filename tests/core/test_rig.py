@@ -81,8 +81,10 @@ def test_wrong_values_name_file_key_value_and_what_was_expected(
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "compose.yaml"
     path.write_text("services: {web: {image: nginx}}\n")
-    with pytest.raises(BadInputError, match=r"is not a rig\.yaml: it has 'services'"):
-        Rig.load(path)
+    for wrong in (Rig.load, Rig(camera=CAMERA).save):
+        with pytest.raises(BadInputError, match=r"is not a rig\.yaml: it has 'services'"):
+            wrong(path)
+    assert path.read_text().startswith("services")
 
 
 def test_a_link_to_no_file_is_an_empty_rig(tmp_path: Path) -> None:
