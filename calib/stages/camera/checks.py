@@ -340,6 +340,13 @@ class Evidence:
         """c_i(d), (N,)."""
         return np.asarray(self.cost + 2 * self.b @ d + np.einsum("g,ngh,h->n", d, self.S, d))
 
+    def of_the_camera(self) -> Evidence:
+        """The same about the intrinsics, the target's deformation eliminated from all views together."""
+        P = self.intrinsics
+        S = self.S.sum(axis=0)
+        follow = np.concatenate([np.eye(P), -S[:P, P:] @ scaled_inverse(S[P:, P:])], axis=1)
+        return replace(self, names=self.names[:P], S=follow @ self.S @ follow.T, b=self.b @ follow.T)
+
 
 def eliminated(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """S (N, G, G) and b (N, G) of views, their poses eliminated, from `bundle.Linearised`."""
@@ -652,7 +659,7 @@ def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
     changes from view to view is another by as much.
     """
     try:
-        inflation = overdispersion(evidence(calibration, calibration.basis))
+        inflation = overdispersion(evidence(calibration, calibration.basis).of_the_camera())
         tells = calibration.basis is None and calibration.observations.views >= _TELL_SHAPE
         shape, ran = (shape_or_none(calibration), drift(calibration)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):

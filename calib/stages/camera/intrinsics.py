@@ -43,9 +43,11 @@ from calib.stages.camera.triage import Triage, triage, turned_views
 from calib.stages.camera.verdict import (
     Limits,
     judge,
+    of_board,
     of_copies,
     of_faults,
     of_leaving,
+    repeated_errors,
     two_cameras,
 )
 
@@ -407,6 +409,10 @@ def _beats(richer: Candidate, simpler: Candidate, gain_px: float) -> bool:
 _HOPELESS = 0.02
 """RMS over the picture's larger side from which on the points belong to no camera at all."""
 _ROUGH = "radial2"
+_LEAST_FOR_A_BOARD = 3
+"""Views from which on they may tell the board's shape."""
+_CERTAIN = 4.0
+"""Deviations of what repeats at the same corners, beyond which the board is not the one described."""
 _TRIAGES = 3
 """Times that a model is chosen; bad views can make the first choice wrong."""
 _FEW_ODD = 2
@@ -548,6 +554,22 @@ def calibrate_camera(
     if turned and not choices.keep_all:
         everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
         sorted_out, models = _sorted_out(everything, image_size_px, choices)
+    shaped, bent = everything, choices.board != "auto"
+    for _ in range(0 if bent else _TRIAGES):
+        some = _of_target(sorted_out.calibration, everything)
+        by_its_shape = _with_board(checks.widened(some) if choices.model == "auto" else some, choices)
+        if by_its_shape.name == "rigid":
+            break
+        # The bend of a board passes for a lens's, and bad views hide behind the errors of a wrong board.
+        bent, straight = True, by_its_shape.fit.shaped(everything)
+        again, models_again = _sorted_out(straight, image_size_px, choices)
+        if len(_gone(again)) > max(len(_gone(sorted_out)), Limits.leaving_bad * everything.views):
+            break
+        settled = _gone(again) == _gone(sorted_out)
+        shaped, sorted_out, models = straight, again, models_again
+        of_all = of_all if turned else sorted_out.everything
+        if settled:
+            break
     odd = [*turned, *(one for one in sorted_out.left_out if one.name not in by_name)]
     leaving = [*left_out, *unusable, *odd]
     agree = sorted_out.calibration.observations.views
@@ -559,9 +581,9 @@ def calibrate_camera(
             findings += several
         elif any(one.severity == "inconsistent" for one in several):
             # Of two cameras that share the views neither is the odd one, and no view is to blame.
-            lens, start, models = _chosen_model(everything, image_size_px, choices)
+            lens, start, models = _chosen_model(shaped, image_size_px, choices)
             first = None if start is None else start.block
-            fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, start=first)
+            fit = calibrate(shaped, image_size_px, lens.model, skew=lens.skew, start=first)
             sorted_out = Triage.of_all(fit)
             leaving = [*left_out, *unusable, *turned]
             findings = list(of_leaving(leaving, everything.views, choices.keep_all))
@@ -572,25 +594,28 @@ def calibrate_camera(
         fit = sorted_out.everything
     if choices.loss != "none":
         fit = refitted(fit, loss=choices.loss)
-    board: str = choices.board
-    boards: tuple[Candidate, ...] = ()
-    if board != "rigid":
-        fit, board, boards = _with_board(fit, choices)
+    fit = _of_target(fit, everything)
+    board = _with_board(fit, choices) if bent else _Board(fit, fit, "rigid", ())
+    fit = board.fit
     if fit.termination == "behind the camera":
         raise _no_camera(fit.observations, "a solution has points behind the camera")
     solved = time.perf_counter()
     sigma = checks.by_the_views(fit)
     covered = time.perf_counter()
     findings += of_copies(copies)
-    verdict = _judged(fit, findings)
+    of_shape = of_board(board.flat, board.name)
+    verdict = _judged(fit, [*findings, *of_shape])
     if shared and verdict.word in ("ok", "poor"):
-        verdict = _judged(fit, [*findings, *shared])
-    if verdict.word == "unidentifiable" and (better := checks.best_of_starts(fit)) is not fit:
-        fit, sigma = better, checks.by_the_views(better)
-        verdict = _judged(fit, findings)
+        verdict = _judged(fit, [*findings, *of_shape, *shared])
+    if verdict.word == "unidentifiable":
+        # Views that do not tell the camera do not tell the board's shape either.
+        better = checks.best_of_starts(board.flat if choices.board == "auto" else fit)
+        if better is not fit:
+            fit, board, sigma = better, board._replace(name="rigid"), checks.by_the_views(better)
+            verdict = _judged(fit, findings)
     judged = time.perf_counter()
     seconds = {"solve": solved - began, "covariance": covered - solved, "judge": judged - covered}
-    return Intrinsics(fit, sigma, verdict, models, boards, board, tuple(not_used), seconds)
+    return Intrinsics(fit, sigma, verdict, models, board.compared, board.name, tuple(not_used), seconds)
 
 
 def without_copies(
@@ -630,11 +655,11 @@ def _on_its_board(fit: Calibration) -> Calibration:
 def _screened(fit: Calibration) -> Triage:
     """The views that agree: on a board as it is described, or of another shape where more agree on that."""
     found = triage(fit)
-    everything, gone = fit.observations, {one.name for one in found.left_out if one.kind == "view"}
+    everything, gone = fit.observations, _gone(found)
     for source in (fit, found.calibration) if gone else ():
         shape = checks.certain_shape(source)
         other = None if shape is None else triage(checks.straightened(fit, shape.displacement_m))
-        leaving = {one.name for one in other.left_out if one.kind == "view"} if other else gone
+        leaving = _gone(other) if other else gone
         if other is None or len(leaving) >= len(gone):
             continue
         kept = np.flatnonzero(~np.isin(everything.names, list(leaving)))
@@ -650,7 +675,7 @@ def _alone_odd(found: Triage) -> bool:
 
     Where those few differ by much, views that agree may seem to share a second camera with them.
     """
-    if sum(one.kind == "view" for one in found.left_out) > _FEW_ODD:
+    if len(_gone(found)) > _FEW_ODD:
         return False
     alone, together = checks.alone_px(_on_its_board(found.calibration))
     return together < Limits.change_times * alone
@@ -728,20 +753,59 @@ def _no_camera(observations: Observations, what: str) -> BadInputError:
     return BadInputError(f"no camera fits these views: {what}. {why}")
 
 
-def _with_board(rigid: Calibration, choices: Choices) -> tuple[Calibration, str, tuple[Candidate, ...]]:
+def _of_target(fit: Calibration, everything: Observations) -> Calibration:
+    """The same views of the target as it is described."""
+    seen = fit.observations
+    if seen.target_m is everything.target_m or not seen.same_target:
+        return fit
+    described = Observations(seen.names, everything.target_m, seen.pixels, seen.present)
+    return refitted(fit, observations=described)
+
+
+def _gone(found: Triage) -> set[str]:
+    """Names of the views that leave."""
+    return {one.name for one in found.left_out if one.kind == "view"}
+
+
+class _Board(NamedTuple):
+    """A fit to the board as described, one with a model of its shape, its name, and what was compared."""
+
+    flat: Calibration
+    fit: Calibration
+    name: str
+    compared: tuple[Candidate, ...]
+
+
+def _with_board(flat: Calibration, choices: Choices) -> _Board:
     """The same camera with the board model that was asked for, or that views held back prefer."""
-    if not rigid.observations.same_target:
-        raise BadInputError(f"--board {choices.board} needs the same points of the target in every view")
-    if choices.board == "auto" and rigid.observations.views < 3:
-        return rigid, "rigid", ()
+    observations = flat.observations
+    as_described = _Board(flat, flat, "rigid", ())
+    if choices.board == "rigid":
+        return as_described
     if choices.board == "auto":
-        found = candidates_by_board(rigid)
-        best = simplest_good([candidate for candidate, _ in found], scale_of(rigid.camera.image_size_px))
-        return found[best][1], found[best][0].name, tuple(candidate for candidate, _ in found)
-    observations = rigid.observations
+        if observations.views < _LEAST_FOR_A_BOARD or not observations.same_target:
+            return as_described
+        shape, chance = checks.shape_or_none(flat), _CERTAIN / np.sqrt(observations.target_m.shape[1])
+        refuted = (shape is not None and shape.certain) or repeated_errors(flat) ** 2 > 1.0 + chance
+        if not refuted and (shape is None or not shape.allowed):
+            return as_described
+        found = candidates_by_board(flat)
+        compared = tuple(one for one, _ in found)
+        best = simplest_good(compared, scale_of(flat.camera.image_size_px))
+        if refuted:
+            # No reason is left to prefer the simplest, nor to count against a shape that it is known no
+            # better than the corners are, which moves the camera by little.
+            noise = np.log1p([one.parameters / (2 * observations.points) for one in compared])
+            best = int(np.argmin(np.array([np.mean(np.log(one.per_view_px2)) for one in compared]) - noise))
+        alone, together = checks.alone_px(found[best][1])
+        # What changes from view to view is no shape of one board.
+        best = 0 if together > Limits.change_times * alone else best
+        return _Board(flat, found[best][1], compared[best].name, compared)
+    if not observations.same_target:
+        raise BadInputError(f"--board {choices.board} needs the same points of the target in every view")
     basis = board_basis(observations.target_m[0], choices.board)
-    if basis is not None and 2 * observations.points <= len(basis) + len(rigid.free) + 6 * observations.views:
+    if basis is not None and 2 * observations.points <= len(basis) + len(flat.free) + 6 * observations.views:
         raise BadInputError(
             f"--board {choices.board} has more unknowns than {observations.views} views can fix"
         )
-    return refitted(rigid, basis=basis, loss=choices.loss, fixed=()), choices.board, ()
+    return _Board(flat, refitted(flat, basis=basis, loss=choices.loss, fixed=()), choices.board, ())

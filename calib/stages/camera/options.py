@@ -56,7 +56,9 @@ class Choices:
     )
     loss: Literal["none", "huber", "cauchy"] = option("none", "Robust loss of the residuals.")
     board: Literal["rigid", "warp", "released", "auto"] = option(
-        "rigid", "The board: flat, bent by two parameters, with free corners, or compared."
+        "auto",
+        "The board: flat, bent by two parameters, with free corners; auto compares them on views held back "
+        "where the views contradict a flat one.",
     )
     keep_all: bool = option(
         False, "Use pictures and points as well that do not agree with the others; by default they leave."

@@ -505,13 +505,8 @@ def _of_misfit(calibration: bundle.Calibration) -> Iterator[Finding]:
         yield Finding("inconsistent" if typical > 3 * limit else "poor", text, advice)
     fine = present & ~bad[:, None]
     yield from _of_points(np.sqrt(squared), fine, names)
-    repeated = _repeated(calibration)
-    if repeated > Limits.repeated_remark:
-        text = (
-            f"Errors repeat at the same corners of the board from view to view, {repeated:.1f} times "
-            "what independent errors would leave: the printed board is not exactly as described."
-        )
-        yield Finding("remark", text)
+    if (repeated := repeated_errors(calibration)) > Limits.repeated_remark:
+        yield Finding("remark", f"{_REPEATED.format(repeated)}.")
     ordered = np.sort(squared[fine])
     heavy = float(ordered[-max(1, len(ordered) // 100) :].sum() / max(ordered.sum(), 1e-300))
     if heavy > Limits.heavy_remark:
@@ -559,7 +554,7 @@ def _of_points(distance: FloatArray, fine: BoolArray, names: tuple[str, ...]) ->
         yield Finding("poor" if many else "remark", text, advice)
 
 
-def _repeated(calibration: bundle.Calibration) -> float:
+def repeated_errors(calibration: bundle.Calibration) -> float:
     """RMS over the target's points of the mean residual over views, in the target's axes.
 
     Over what it would be if the views' errors were independent.
@@ -657,11 +652,43 @@ def _of_split(found: checks.Split | None, calibration: bundle.Calibration) -> It
     yield Finding("inconsistent", text, _SEPARATELY)
 
 
-def _of_target(found: checks.TargetShape | None, calibration: bundle.Calibration) -> Iterator[Finding]:
+_REPEATED = (
+    "Errors repeat at the same corners of the board from view to view, {:.1f} times what independent errors "
+    "would leave: the printed board is not exactly as described"
+)
+
+
+def of_board(rigid: bundle.Calibration, board: str) -> list[Finding]:
+    """What a board is whose shape is estimated along, by the fit to the one described.
+
+    Parameters
+    ----------
+    board : model of the shape, as in `Choices.board`.
+    """
+    if board == "rigid":
+        return []
+    shape, repeated = checks.shape_or_none(rigid), repeated_errors(rigid)
+    if findings := list(_of_target(shape, rigid, board)):
+        return findings
+    if repeated > Limits.repeated_remark:
+        return [Finding("remark", f"{_REPEATED.format(repeated)}{_ESTIMATED}.")]
+    if shape is None or not shape.allowed:
+        return []
+    sure = f"{shape.significance:.0f} standard deviations"
+    return [Finding("remark", f"The board is not quite as described ({sure}){_ESTIMATED}.")]
+
+
+_ESTIMATED = "; its shape is estimated along with the camera"
+
+
+def _of_target(
+    found: checks.TargetShape | None, calibration: bundle.Calibration, board: str = "rigid"
+) -> Iterator[Finding]:
     """Squares that are square, on a board that is flat."""
     if found is None:
         return
-    off, allowed = abs(found.aspect), "; sigma allows for it" if found.allowed else ""
+    off, bends = abs(found.aspect), board != "rigid"
+    allowed = _ESTIMATED if bends else "; sigma allows for it" if found.allowed else ""
     squares = (
         f"the board's squares are {1 + found.aspect:.3f} times as high as wide "
         f"(standard deviation {found.aspect_sigma:.3f})"
@@ -686,20 +713,21 @@ def _of_target(found: checks.TargetShape | None, calibration: bundle.Calibration
     certain = found.bow_significance > Limits.bow_sigma
     if (certain or found.bent) and (bend > Limits.bow_remark or moved > Limits.bow_focal_remark):
         text = (
-            f"The board is not flat: it is bent by about {1e3 * found.bow_m:.1f} mm over "
-            f"{1e3 * found.size_m:.0f} mm ({found.bow_significance:.0f} standard deviations; up to "
-            f"{100 * Limits.bow_bad:.0f} % is good), which moves the focal length by {100 * moved:.1f} %"
-            f"{allowed}."
+            f"The board is not flat: it is bent by about {100 * bend:.1f} % of its size ("
+            f"{found.bow_significance:.0f} standard deviations; up to {100 * Limits.bow_bad:.0f} % is good), "
+            f"which {'would move' if bends else 'moves'} the focal length by {100 * moved:.1f} %{allowed}."
         )
         kind: Severity = "remark"
-        if certain:
+        if certain and not bends:
             kind = "inconsistent" if bend > Limits.bow_bad else "poor" if moved > Limits.bow_focal else kind
-        advice = "Glue the board to a flat plate, or let its shape be fitted (--board warp)."
+        advice = "Glue the board to a flat plate."
+        if not bends:
+            advice = f"{advice[:-1]}, or let its shape be estimated (--board auto)."
         yield Finding(kind, text, advice)
-    elif found.focal_per_bow > Limits.fragile:
+    elif not bends and found.focal_per_bow > Limits.fragile:
         text = (
             "The focal length hangs on the board's flatness: a bend of half a percent of its size "
-            f"({5 * found.size_m:.1f} mm) would move it by {100 * found.focal_per_bow:.1f} %."
+            f"would move it by {100 * found.focal_per_bow:.1f} %."
         )
         yield Finding("remark", text, _MORE_TILT)
 
@@ -761,12 +789,14 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
-    known = checks.by_the_views(sturdy)
+    known = checks.by_the_views(calibration if sturdy is fit else sturdy)
     findings += _of_projection(sturdy, known)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = checks.widened(some)
     shape = checks.target_shape(wide)
-    findings += [*_of_richer(some, wide), *_of_target(shape, wide)]
+    findings += _of_richer(some, wide)
+    if calibration.basis is None:
+        findings += _of_target(shape, wide)
     if shape is not None:
         wide = checks.straightened(wide, shape.displacement_m)
     findings += [
