@@ -51,6 +51,8 @@ def test_the_size_of_an_unknown_board_is_found_and_a_turned_one_is_the_same(
     found = _camera(rig)
     calib("intrinsics", folder, *RADIAL2, "--rig", rig, "--corners", "5x7", "--square", "20mm")
     assert _camera(rig)["fx_px"] == pytest.approx(found["fx_px"], rel=1e-6)
+    distance = [one["projection_sigma_px"]["distance_m"] for one in (found, _camera(rig))]
+    assert distance == [None, pytest.approx(0.3, abs=0.1)]
 
 
 def test_a_wrong_size_is_answered_with_what_was_found(calib, pictures, tmp_path) -> None:

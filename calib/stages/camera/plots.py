@@ -340,9 +340,9 @@ def _projection_sigma(fit: Calibration, sigma: Covariance) -> plot.Figure:
     # What moves by more than the picture's size is not known at all.
     values[values > math.hypot(*size)] = np.inf
     note = (
-        f"With pictures taken again, the camera would put a point {plot.number(sigma.distance_m, 'm')} away "
-        "elsewhere by this standard deviation, in the worst direction. The dashed line is the hull of the "
-        "corners seen; beyond it the camera extrapolates."
+        "With pictures taken again, the camera would put a point at the boards' distance elsewhere by this "
+        "standard deviation, in the worst direction. The dashed line is the hull of the corners seen; beyond "
+        "it the camera extrapolates."
     )
     outline = plot.Shape(hull(fit.observations.pixels[fit.observations.present]), edge="red", kind="dashed")
     panel = picture(size, (plot.Field(u, v, values, "px", "standard deviation (px)"), outline))

@@ -801,6 +801,7 @@ class ViewSet:
     hashes : SHA-256 of each input by its name.
     left_out : files that are there and not used.
     remarks : sentences for the person who watches.
+    square_known : whether lengths are in metres, not in squares.
     """
 
     views: tuple[View, ...]
@@ -809,6 +810,7 @@ class ViewSet:
     left_out: tuple[LeftOut, ...]
     remarks: tuple[str, ...]
     simulated: bool = False
+    square_known: bool = True
 
 
 def read_views(
@@ -854,7 +856,10 @@ def _from_table(path: Path, told: Told) -> ViewSet:
     for view in views:
         _check_inside(path, view, told.image_size_px)
         _check_extent(path, view)
-    return ViewSet(_near_origin(views), told.image_size_px, {shown(path.name): digest}, (), remarks)
+    return ViewSet(
+        _near_origin(views), told.image_size_px, {shown(path.name): digest}, (), remarks,
+        square_known=not remarks,
+    )  # fmt: skip
 
 
 def _check_inside(path: Path, view: View, image_size_px: tuple[int, int]) -> None:
@@ -947,7 +952,10 @@ def _from_pictures(sources: Sequence[Path], told: Told, progress: Callable[[int,
         }
         # Of a recording most frames are left out; the remark counts them.
         left_out = [file for file in left_out if file.name not in names]
-    return ViewSet(views, found.image_size_px, hashes, tuple(left_out), tuple(remarks), file.simulated)
+    return ViewSet(
+        views, found.image_size_px, hashes, tuple(left_out), tuple(remarks), file.simulated,
+        square_known=square_m is not None,
+    )  # fmt: skip
 
 
 def _of_recording(

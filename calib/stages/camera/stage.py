@@ -68,7 +68,7 @@ def _solve_intrinsics(found: ViewSet, options: IntrinsicsOptions, detect_s: floa
     sigma_px = projection_sigma_px(fit, known, grid[ahead])
     bounded = sigma_px[np.isfinite(sigma_px)]
     projection = {
-        "distance_m": known.distance_m,
+        "distance_m": known.distance_m if found.square_known else None,
         "median": float(np.median(bounded)) if len(bounded) else None,
         "max": float(bounded.max()) if len(bounded) == len(sigma_px) else None,
     }
