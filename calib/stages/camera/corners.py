@@ -79,6 +79,9 @@ _UNREFINED_SHARE, _CLOSE_UNREFINED_SHARE = 0.1, 0.25
 _MISFIT = 0.08
 """Largest typical distance of a corner from where the others place it, in squares."""
 _MEDIAN_RESIDUAL = 0.25
+_LOOSE = 0.02
+"""Typical standard deviation of a corner, in squares, from which on squares have to meet: the place along a
+stripe's edge is free. Stripes have .032 and more, blurred, pale and small boards .009 and less."""
 _CLOSE_MISFIT = 0.03
 """Misfit, in squares, below which a grid is close: its corners may have another shape."""
 _NEAR, _NEAR_PX = 0.06, 1.2
@@ -234,6 +237,8 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
         return "too little contrast"
     if np.median(grid.residual) > _MEDIAN_RESIDUAL and not (close and _squares_meet(grid)):
         return "corners of another shape"
+    if np.median(grid.sigma_px) > _LOOSE * square and not _squares_meet(grid):
+        return "edges without corners"
     if not grid.misfit_px < _MISFIT * square:
         return "corners off the grid"
     if not _turns_alike(grid.points):
