@@ -294,9 +294,10 @@ class Session:
             return ""
         size = _size_of(gray) if self.corners else None
         if size and self.corners and sorted(size) != sorted(self.corners):
+            seen, expected = (f"{columns}x{rows}" for columns, rows in (size, self.corners))
             return (
-                f"A board of {size[0]}x{size[1]} inner corners is seen, expected {self.corners[0]}x"
-                f"{self.corners[1]}: show all of that one, or begin a new folder, or give --corners."
+                f"A board of {seen} inner corners is seen, expected {expected}: show all of that one, or "
+                f"begin a new folder with --corners {seen}."
             )
         other = None if size else other_board(gray)
         if other is None:

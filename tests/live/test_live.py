@@ -176,7 +176,9 @@ def test_what_else_is_held_into_the_picture_is_named() -> None:
     other = Session(corners=(9, 6), size_px=CAMERA.image_size_px)
     whole = person.frame(person.pose_at(session().ghost()))
     assert "whole board of 9x6 inner corners" in other.look(whole, 0.0).says
-    assert "A board of 8x5 inner corners is seen, expected 9x6: show" in other.look(whole, 3.0).says
+    says = other.look(whole, 3.0).says
+    assert "A board of 8x5 inner corners is seen, expected 9x6: show" in says
+    assert "a new folder with --corners 8x5" in says
 
 
 MARKED = charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75)
