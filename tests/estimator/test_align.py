@@ -226,7 +226,7 @@ def test_a_swing_of_four_pictures_in_a_period_is_aligned() -> None:
         (0.0, 0.0, 0.0, "", "ok"),
         (0.3, 0.0, 0.0, "ellipse1: the mount angle differs", "poor"),
         (0.0, 0.01, 0.0, "gyroscope's bias differs from that in the other logs by +0.010", "ok"),
-        (0.0, 0.0, 0.003, "swing0: the time offset differs from that in the other logs by +0.003", "poor"),
+        (0.0, 0.0, 0.003, "swing0: the time offset differs from that in the other logs by +0.0029", "poor"),
     ],
 )
 def test_sigma_holds_what_is_another_in_one_log(
@@ -299,7 +299,7 @@ def test_late_accelerations_are_taken_at_the_moments_of_the_rates() -> None:
     t[30] = t[29]
     readings = np.column_stack([9.0 + np.sin(20.0 * (t - 0.002)), np.full(60, np.nan), np.zeros(60)])
     none = np.zeros((0, 2))
-    stretch = Stretch(0, none[:, 0], none, t, readings, Knots(0.0, 0.01, 60), none, none)
+    stretch = Stretch(0, none[:, 0], none, t, readings, Knots(0.0, 0.01, 60), none, none, none)
     there = _accelerations_at(stretch, 0.002).readings
     np.testing.assert_allclose(there[2:-2, 0], 9.0 + np.sin(20.0 * t[2:-2]), atol=1e-3)
     assert np.isnan(there[:, 1]).all()
@@ -393,6 +393,16 @@ def test_a_few_wild_readings_of_the_imu_do_little() -> None:
     found = align(logs, prior_settings(trial.view))
     assert np.abs(scores(trial, found)).max() < 3.5
     assert np.all(found.noise.imu < 2.0 * np.array([0.016, 0.016, 0.0025]))
+
+
+def test_the_jerk_of_a_pump_is_no_scale() -> None:
+    """Two readings a knot span do not resolve it: with a fine camera the offset d was 5 sigma off."""
+    nominal = SimulatedRig()
+    trial = known(replace(nominal, tracker=replace(nominal.tracker, jitter_px=0.03, grid_px=0.0)))
+    pumped = twin_log(trial.rig, "steps", {"volts": "0,12,12", "on_s": "1", "off_s": "7"}, 1, 18.0)
+    logs = [align_log(log) for log in (twin_log(trial.rig, *MOTIONS[0], 0), pumped)]
+    found = align(logs, replace(prior_settings(trial.view), grid_px=0.0))
+    assert np.abs(scores(trial, found)).max() < 3.0
 
 
 def test_the_angle_at_rest_and_its_gradient() -> None:
@@ -500,7 +510,7 @@ def _problem(
         readings = readings + NOISE.imu * rng.standard_normal(readings.shape)
     begin = c + np.array([0.02, 0.001]) * rng.standard_normal(c.shape)
     loose = np.full((knots.count - 5, 2), 1e3)
-    stretch = Stretch(0, camera_s, pixels, imu_s, readings, knots, begin, loose)
+    stretch = Stretch(0, camera_s, pixels, imu_s, readings, knots, begin, loose, np.zeros_like(readings))
     return Problem(NUMBERS, 0.0, (stretch,), MEAN, SIGMA), c
 
 

@@ -11,6 +11,7 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.ndimage import maximum_filter1d
 
 from calib.core.arrays import BoolArray, FloatArray, integral, rms, robust_sigma
 from calib.core.compilation import kernel
@@ -170,6 +171,7 @@ class Stretch:
     imu_s, readings : (m,) times and (m, 3) a_x, a_y, g_z, NaN where one is missing.
     knots, start : of the spline, and its coefficients (count, 2) to begin with.
     loose : (spans, 2) deviation of the accelerations of phi and l.
+    missed : (m, 3) by how much the spline misses readings where it cannot follow the motion, elsewhere 0.
     """
 
     log: int
@@ -180,6 +182,7 @@ class Stretch:
     knots: Knots
     start: FloatArray
     loose: FloatArray
+    missed: FloatArray
 
     @cached_property
     def steep(self) -> FloatArray:
@@ -203,9 +206,10 @@ class Noise:
     imu: FloatArray
     age_s: float = 0.0
 
-    def of(self, steep: FloatArray) -> FloatArray:
-        """Deviations (n, 3) of readings that change so much in a second."""
-        return np.asarray(np.hypot(self.imu, self.age_s * steep))
+    def of(self, stretch: Stretch, part: slice) -> FloatArray:
+        """Deviations (n, 3) of a part of a stretch's readings."""
+        known = np.hypot(self.imu, self.age_s * stretch.steep[part])
+        return np.asarray(np.hypot(known, stretch.missed[part]))
 
 
 @dataclass(frozen=True)
@@ -267,11 +271,11 @@ def _pictures(
 
 def _readings(
     stretch: Stretch, c: FloatArray, sensor: FloatArray
-) -> Iterator[tuple[FloatArray, Rows, FloatArray]]:
-    """Readings (k, 3) of the IMU minus predicted with their rows and steepness, a chunk at a time."""
+) -> Iterator[tuple[FloatArray, Rows, slice]]:
+    """Readings (k, 3) of the IMU minus predicted with their rows, and which they are, a chunk at a time."""
     for part in chunks(len(stretch.imu_s)):
         rows = imu_rows(stretch.knots, c, sensor, stretch.imu_s[part])
-        yield stretch.readings[part] - rows.predicted, rows, stretch.steep[part]
+        yield stretch.readings[part] - rows.predicted, rows, part
 
 
 def pictures_off(problem: Problem, stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatArray:
@@ -317,7 +321,7 @@ def _loss(problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise) -
     total = 0.5 * float((((s - problem.mean) / problem.sigma) ** 2).sum())
     for stretch, c in zip(problem.stretches, cs, strict=True):
         total += sum(_picture_terms(problem, noise, off)[0] for off, _ in _pictures(problem, stretch, c, s))
-        total += sum(imu_terms(off, noise.of(steep))[0] for off, _, steep in _readings(stretch, c, s))
+        total += sum(imu_terms(off, noise.of(stretch, part))[0] for off, _, part in _readings(stretch, c, s))
         total += _prior(stretch, c)[0]
     return total
 
@@ -340,8 +344,8 @@ def _normal(
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
             good.append(likely)
-        for off, rows, steep in _readings(stretch, c, s):
-            _, pull, weight = imu_terms(off, noise.of(steep))
+        for off, rows, part in _readings(stretch, c, s):
+            _, pull, weight = imu_terms(off, noise.of(stretch, part))
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
         weight, pull = 1.0 / stretch.loose**2, _prior(stretch, c)[1]
@@ -730,7 +734,7 @@ def _stretch(piece: Piece, offset_s: float) -> Stretch | None:
     length = _spline(knots, [(t, piece.length[use], 0, 1.5e-3)], 0.5)
     return Stretch(
         piece.log, piece.camera.t_s[inside], piece.pixels[inside], piece.imu.t_s, piece.readings, knots,
-        np.stack([phi, length], axis=1), _loose(knots, piece),
+        np.stack([phi, length], axis=1), _loose(knots, piece), np.zeros_like(piece.readings),
     )  # fmt: skip
 
 
@@ -862,8 +866,8 @@ def _imu_noise(
         to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in signs], np.zeros((_PROBES, len(s)))
         for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
             done = 0
-            for off, rows, steep in _readings(stretch, c, s):
-                deviation = noise.of(steep)
+            for off, rows, part in _readings(stretch, c, s):
+                deviation = noise.of(stretch, part)
                 _, pull, weight = imu_terms(off, deviation)
                 # Beyond `HUBER` deviations a reading counts as one there: a few wild ones are no noise.
                 squares[channel] += ((pull[:, channel] * deviation[:, channel]) ** 2).sum()
@@ -895,15 +899,15 @@ def _age_s(problem: Problem, cs: list[FloatArray], s: FloatArray, imu: FloatArra
     ----------
     lost : (3,) factors by which the fit has made the squares of residuals smaller.
     """
-    off = np.concatenate(
-        [readings_off(one, c, s)[:, 2] for one, c in zip(problem.stretches, cs, strict=True)]
-    )
-    steep = np.concatenate([one.steep[:, 2] for one in problem.stretches])
-    known = np.isfinite(off)
-    squares, steep = lost[2] * off[known] ** 2, steep[known]
+    rates = [
+        np.stack([readings_off(one, c, s)[:, 2], one.steep[:, 2], one.missed[:, 2]])
+        for one, c in zip(problem.stretches, cs, strict=True)
+    ]
+    off, steep, missed = (whole := np.concatenate(rates, axis=1))[:, np.isfinite(whole[0])]
+    squares, quiet = lost[2] * off**2, imu[2] ** 2 + missed**2
     losses = np.empty(len(_AGES_S))
     for k, age in enumerate(_AGES_S):
-        variance = imu[2] ** 2 + (age * steep) ** 2
+        variance = quiet + (age * steep) ** 2
         losses[k] = 0.5 * float((np.log(variance) + np.minimum(squares / variance, HUBER**2)).sum())
     best = int(np.argmin(losses))
     return float(_AGES_S[best]) if losses[best] < losses[0] - _AGE_GAIN else 0.0
@@ -963,12 +967,44 @@ def solve(problem: Problem, sensor: FloatArray, noise: Noise) -> Fit:
     return Fit(s, covariance, cs, noise, goods, steps, converged, arrow)
 
 
+_UNFOLLOWED = 5.0
+"""Deviations from which on a residual is no noise: of Gaussian noise one in two million."""
+_FREE_BEND = 1e6
+"""Deviation of a curve's second derivative, which a gap alone feels: in a swing it is 1e4 m/s^4."""
+
+
+def _followed(stretch: Stretch, c: FloatArray, fit: Fit) -> Stretch:
+    """A stretch whose readings weigh less within a span of those that no spline on its knots follows.
+
+    A pump that is switched jerks the head for one or two readings, which resolve that no better than the
+    knots do: by how much the velocity has changed is not known from them, and scales would make up for it.
+    Both the fit and a spline of the readings alone miss them. The latter follows readings that contradict the
+    pictures, and the fit those beside a wild one.
+    """
+    known = np.isfinite(stretch.readings)
+    curves = [
+        _spline(stretch.knots, [(stretch.imu_s[use], values[use], 0, sigma)], _FREE_BEND)
+        for values, use, sigma in zip(stretch.readings.T, known.T, fit.noise.imu.tolist(), strict=True)
+    ]
+    off = np.abs(readings_off(stretch, c, fit.sensor))
+    for part in chunks(len(off)):
+        span, basis = basis_rows(stretch.knots, stretch.imu_s[part])
+        alone = np.einsum("nj,njk->nk", basis[:, 0], np.stack(curves, 1)[span[:, None] + np.arange(6)])
+        off[part] = np.minimum(off[part], np.abs(stretch.readings[part] - alone))
+    off[~known] = 0.0
+    off[off <= _UNFOLLOWED * fit.noise.of(stretch, slice(None))] = 0.0
+    if not off.any():
+        return stretch
+    near = math.ceil(stretch.knots.span_s / float(np.median(np.diff(stretch.imu_s))) - 1e-6)
+    return replace(stretch, start=c, missed=maximum_filter1d(off, 2 * near + 1, axis=0))
+
+
 def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArray:
     """Change (14,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
     stretch, c = problem.stretches[i], fit.coefficients[i]
     to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
-    for off, rows, steep in _readings(stretch, c, fit.sensor):
-        _, _, weight = imu_terms(off, fit.noise.of(steep))
+    for off, rows, part in _readings(stretch, c, fit.sensor):
+        _, _, weight = imu_terms(off, fit.noise.of(stretch, part))
         gathered(rows.span, rows.basis, rows.by, -weight * change, to_c, to_s)
     return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.B[i].T @ fit.arrow.own(i, to_c)))
 
@@ -1304,8 +1340,8 @@ def _own(problem: Problem, fit: Fit, name: str, stretch: Stretch, c: FloatArray)
             # A place that no picture shows has no derivative.
             yield rows, np.where(weight > 0.0, rows.by[:, :, at], 0.0), pull, weight
         return
-    for off, rows, steep in _readings(stretch, c, fit.sensor):
-        _, pull, weight = imu_terms(off, fit.noise.of(steep))
+    for off, rows, part in _readings(stretch, c, fit.sensor):
+        _, pull, weight = imu_terms(off, fit.noise.of(stretch, part))
         yield rows, rows.by[:, :, at], pull, weight
 
 
@@ -1332,9 +1368,7 @@ def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
         )
         change = (before.predicted - after.predicted) / (2.0 * _DIFFERENCE_S)
         change[:, 2] = 0.0
-        _, pull, weight = imu_terms(
-            stretch.readings[part] - rows.predicted, fit.noise.of(stretch.steep[part])
-        )
+        _, pull, weight = imu_terms(stretch.readings[part] - rows.predicted, fit.noise.of(stretch, part))
         yield rows, change, pull, weight
 
 
@@ -1415,6 +1449,12 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
     sensor = mean.copy()
     sensor[_OFFSET] = first.time_offset_s
     fit = solve(problem, sensor, _FIRST_NOISE)
+    followed = tuple(
+        _followed(stretch, c, fit) for stretch, c in zip(problem.stretches, fit.coefficients, strict=True)
+    )
+    if any(stretch.missed.any() for stretch in followed):
+        problem = replace(problem, stretches=followed)
+        fit = solve(problem, fit.sensor, fit.noise)
     late = [one for one in _apart(problem, fit, 1) if one.name == _LATE]
     for one in late:
         at_once = tuple(
