@@ -67,6 +67,8 @@ def test_swings_fill_the_section(calib: Run, rig: Path, swings: list[Path], tmp_
         "zeta by peaks",
     ):
         assert words in ended.out
+    row = next(line.split() for line in ended.out.splitlines() if line.startswith("  length at rest"))
+    assert len(row[3]) == len("0.06497") and len(row[4]) == len("0.00035"), row
     section = yaml.safe_load(rig.read_text())["actuator"]
     for name, truth in (("stiffness_scale", 1.0), ("damping_scale_free_swing", 3.3), ("lambda1_per_s", 3.0)):
         assert abs(section[name] - truth) < 4.0 * section["sigma"][name]

@@ -107,7 +107,7 @@ def _words(sections: Sections) -> list[Block]:
     rows = [
         (
             label_of(name),
-            f"{value:.5g}",
+            number(value, known.sigma[name]),
             f"{known.sigma[name]:.2g}",
             PARAMETERS[name].unit or BLANK,
             PARAMETERS[name].symbol,
