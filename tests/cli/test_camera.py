@@ -211,6 +211,24 @@ def test_the_shipped_plane(calib, project_root, rig) -> None:
     assert set(whole["provenance"]["inputs"]["plane"]) == {"board.yaml", "camera", "plane01.png"}
 
 
+def test_a_print_that_the_camera_was_cleared_of_counts_as_sigma_in_the_plane(calib, folder, rig) -> None:
+    """Residuals of a board in its own shape are no measure for those of the board as it is described."""
+    path = next(folder.glob("*.png"))
+    picture = cv2.imread(str(path))
+    height, width = picture.shape[:2]
+    rng = np.random.default_rng(0)
+    by = [5.0 * cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), 4) for _ in range(2)]
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    moved = cv2.remap(picture, (x + by[0]).astype("f4"), (y + by[1]).astype("f4"), cv2.INTER_CUBIC)
+    cv2.imwrite(str(path), moved)
+    whole = yaml.safe_load(rig.read_text())
+    for board, told in (("rigid", True), ("released", False)):
+        whole["camera"]["board"] = board
+        rig.write_text(yaml.safe_dump(whole))
+        ended = calib("extrinsics", folder, "--rig", rig)
+        assert ("times the camera's own" in ended.out) == told
+
+
 def test_the_plane_of_a_video_is_that_of_its_picture(calib, folder, rig) -> None:
     """A hand covers the board before and after."""
     assert calib("extrinsics", folder, "--rig", rig).code == 0

@@ -318,8 +318,10 @@ def _solve_plane(
     from calib.stages.camera.section import Plane
 
     optics, covariance, box = camera.optics, camera.intrinsic_covariance, workspace_m
+    # Beside residuals of a board in its own shape those of the board as described say nothing.
+    rms_px = camera.rms_px if camera.board == "rigid" else None
     fit = calibrate_plane(
-        optics, covariance, views, workspace_m=box, camera_rms_px=camera.rms_px, placed=placed
+        optics, covariance, views, workspace_m=box, camera_rms_px=rms_px, placed=placed
     )  # fmt: skip
     findings = [*fit.verdict.findings, *doubts]
     sigma = np.sqrt(np.diag(fit.covariance))
