@@ -283,7 +283,7 @@ def test_a_blessed_focal_length_is_right() -> None:
     ("print_error", "bow_m", "sets"), [(0.002, 0.0, 1), (0.002, 0.0, 25), (0.0, 0.002, 25)]
 )
 def test_sigma_holds_on_boards_that_are_not_as_described(print_error: float, bow_m: float, sets: int) -> None:
-    """Corners .2 % of a square off: taken as described, fx was up to 8 of its deviations off.
+    """Corners .2 % of a square off: with a board as described the centre is up to 7 of its deviations off.
 
     A flat board that is as described stays so, and loses no certainty.
     """
