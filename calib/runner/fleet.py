@@ -641,17 +641,8 @@ def finish(store: Store, manifest: Manifest) -> FleetSummary:
 # outlier_of, the constant that stands out most against the fleet. A rig without a number has a null there.
 
 _FIRST = (
-    "name",
-    "serial",
-    "source",
-    "kind",
-    "simulated",
-    "verdict",
-    "code",
-    "sentence",
-    "reasons",
-    "left_out",
-)
+    "name", "serial", "source", "kind", "simulated", "verdict", "code", "sentence", "reasons", "left_out",
+)  # fmt: skip
 _MOST_COLUMNS = 8000
 
 

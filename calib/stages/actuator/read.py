@@ -51,27 +51,10 @@ _KPA = (1.0, 2000.0)
 """What the pressure of a pump is at most."""
 _AIR_KPA = (80.0, 110.0)
 """Pressure of the air, from 2000 m above the sea down to it."""
-_OTHER_UNITS = frozenset(
-    [
-        "ms",
-        "us",
-        "ns",
-        "percent",
-        "pct",
-        "%",
-        "psi",
-        "bar",
-        "mbar",
-        "pa",
-        "hpa",
-        "mpa",
-        "atm",
-        "mmhg",
-        "mn",
-        "kn",
-        "lbf",
-    ]
-)
+_OTHER_UNITS = {
+    "ms", "us", "ns", "percent", "pct", "%", "psi", "bar", "mbar", "pa", "hpa", "mpa", "atm", "mmhg", "mn",
+    "kn", "lbf",
+}  # fmt: skip
 _MOST_BAD = 0.05
 _FEWEST = 20
 _SHORTEST_S = 0.5

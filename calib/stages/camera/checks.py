@@ -486,7 +486,7 @@ def alone_px(calibration: bundle.Calibration) -> tuple[float, float]:
 # Gauss-Newton step from the solution, poses and intrinsics following, gives each with its standard
 # deviation; the problem is close to linear in deformations that are small beside the distance.
 
-_CERTAIN = 4.0
+CERTAIN = 4.0
 """Standard deviations of a deformation, or of a change from view to view, beyond which it is there."""
 _ALLOWED = 2.5
 """The same, beyond which sigma allows for a deformation. A board 0.3 % higher than wide shows at three of its
@@ -530,7 +530,7 @@ class TargetShape:
     @property
     def certain(self) -> bool:
         """Whether the target is not what it is said to be."""
-        return self.significance > _CERTAIN
+        return self.significance > CERTAIN
 
     @property
     def allowed(self) -> bool:
@@ -540,7 +540,7 @@ class TargetShape:
     @property
     def bent(self) -> bool:
         """Whether it is not flat."""
-        return bool(np.any(np.abs(self.values[2:]) > _CERTAIN * self.sigma[2:]))
+        return bool(np.any(np.abs(self.values[2:]) > CERTAIN * self.sigma[2:]))
 
 
 def _basis(calibration: bundle.Calibration) -> tuple[FloatArray, float]:
@@ -643,10 +643,10 @@ def _step(found: Evidence, t: FloatArray, kept: BoolArray | None = None) -> tupl
     freedom = int((found.measured - 6).sum()) - 2 * P
     left = max(float(found.cost.sum()) - float(gain(S, b)), 0.0) / max(freedom, 1)
     sigma = np.sqrt(np.maximum(np.diag(inverse)[-P:], 0.0) * left) * overdispersion(about)
-    return step, bool(np.any(np.abs(step) > _CERTAIN * sigma))
+    return step, bool(np.any(np.abs(step) > CERTAIN * sigma))
 
 
-_TELL_SHAPE = 4
+TELL_SHAPE = 4
 """Views from which on the board's shape is told from the poses."""
 
 
@@ -660,7 +660,7 @@ def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
     """
     try:
         inflation = overdispersion(evidence(calibration, calibration.basis).of_the_camera())
-        tells = calibration.basis is None and calibration.observations.views >= _TELL_SHAPE
+        tells = calibration.basis is None and calibration.observations.views >= TELL_SHAPE
         shape, ran = (shape_or_none(calibration), drift(calibration)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
         inflation, shape, ran = 1.0, None, None

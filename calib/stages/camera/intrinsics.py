@@ -409,10 +409,6 @@ def _beats(richer: Candidate, simpler: Candidate, gain_px: float) -> bool:
 _HOPELESS = 0.02
 """RMS over the picture's larger side from which on the points belong to no camera at all."""
 _ROUGH = "radial2"
-_LEAST_FOR_A_BOARD = 3
-"""Views from which on they may tell the board's shape."""
-_CERTAIN = 4.0
-"""Deviations of what repeats at the same corners, beyond which the board is not the one described."""
 _TRIAGES = 3
 """Times that a model is chosen; bad views can make the first choice wrong."""
 _FEW_ODD = 2
@@ -555,21 +551,10 @@ def calibrate_camera(
         everything = everything.select(np.flatnonzero(~np.isin(everything.names, list(by_name))))
         sorted_out, models = _sorted_out(everything, image_size_px, choices)
     shaped, bent = everything, choices.board != "auto"
-    for _ in range(0 if bent else _TRIAGES):
-        some = _of_target(sorted_out.calibration, everything)
-        by_its_shape = _with_board(checks.widened(some) if choices.model == "auto" else some, choices)
-        if by_its_shape.name == "rigid":
-            break
-        # The bend of a board passes for a lens's, and bad views hide behind the errors of a wrong board.
-        bent, straight = True, by_its_shape.fit.shaped(everything)
-        again, models_again = _sorted_out(straight, image_size_px, choices)
-        if len(_gone(again)) > max(len(_gone(sorted_out)), Limits.leaving_bad * everything.views):
-            break
-        settled = _gone(again) == _gone(sorted_out)
-        shaped, sorted_out, models = straight, again, models_again
-        of_all = of_all if turned else sorted_out.everything
-        if settled:
-            break
+    if not bent:
+        rigid = sorted_out
+        sorted_out, models, shaped, bent = _on_the_board_seen(everything, rigid, models, choices)
+        of_all = of_all if turned or sorted_out is rigid else sorted_out.everything
     odd = [*turned, *(one for one in sorted_out.left_out if one.name not in by_name)]
     leaving = [*left_out, *unusable, *odd]
     agree = sorted_out.calibration.observations.views
@@ -603,7 +588,7 @@ def calibrate_camera(
     sigma = checks.by_the_views(fit)
     covered = time.perf_counter()
     findings += of_copies(copies)
-    of_shape = of_board(board.flat, board.name)
+    of_shape = [] if board.name == "rigid" else of_board(board.flat)
     verdict = _judged(fit, [*findings, *of_shape])
     if shared and verdict.word in ("ok", "poor"):
         verdict = _judged(fit, [*findings, *of_shape, *shared])
@@ -650,6 +635,31 @@ def _on_its_board(fit: Calibration) -> Calibration:
     """
     shape = checks.certain_shape(fit)
     return fit if shape is None else checks.straightened(fit, shape.displacement_m)
+
+
+def _on_the_board_seen(
+    everything: Observations, found: Triage, models: tuple[Candidate, ...], choices: Choices
+) -> tuple[Triage, tuple[Candidate, ...], Observations, bool]:
+    """The views that agree, and their lens model, on a board of the shape that they tell.
+
+    With all views of that board, and whether it is another than the one described. The bend of a board passes
+    for a lens's, and bad views hide behind the errors of a wrong board.
+    """
+    shaped, bent = everything, False
+    for _ in range(_TRIAGES):
+        fit = _of_target(found.calibration, everything)
+        board = _with_board(checks.widened(fit) if choices.model == "auto" else fit, choices)
+        if board.name == "rigid":
+            break
+        bent, straight = True, board.fit.shaped(everything)
+        again, models_again = _sorted_out(straight, fit.camera.image_size_px, choices)
+        if len(_gone(again)) > max(len(_gone(found)), Limits.leaving_bad * everything.views):
+            break
+        settled = _gone(again) == _gone(found)
+        shaped, found, models = straight, again, models_again
+        if settled:
+            break
+    return found, models, shaped, bent
 
 
 def _screened(fit: Calibration) -> Triage:
@@ -783,13 +793,16 @@ def _with_board(flat: Calibration, choices: Choices) -> _Board:
     if choices.board == "rigid":
         return as_described
     if choices.board == "auto":
-        if observations.views < _LEAST_FOR_A_BOARD or not observations.same_target:
+        if observations.views < checks.TELL_SHAPE or not observations.same_target:
             return as_described
-        shape, chance = checks.shape_or_none(flat), _CERTAIN / np.sqrt(observations.target_m.shape[1])
+        shape, chance = checks.shape_or_none(flat), checks.CERTAIN / np.sqrt(observations.target_m.shape[1])
         refuted = (shape is not None and shape.certain) or repeated_errors(flat) ** 2 > 1.0 + chance
         if not refuted and (shape is None or not shape.allowed):
             return as_described
         found = candidates_by_board(flat)
+        if not found or found[0][1] is not flat:
+            # Without a camera there is nothing to compare with.
+            return as_described
         compared = tuple(one for one, _ in found)
         best = simplest_good(compared, scale_of(flat.camera.image_size_px))
         if refuted:

@@ -658,17 +658,10 @@ _REPEATED = (
 )
 
 
-def of_board(rigid: bundle.Calibration, board: str) -> list[Finding]:
-    """What a board is whose shape is estimated along, by the fit to the one described.
-
-    Parameters
-    ----------
-    board : model of the shape, as in `Choices.board`.
-    """
-    if board == "rigid":
-        return []
+def of_board(rigid: bundle.Calibration) -> list[Finding]:
+    """What a board is whose shape is estimated along, by the fit to the one described."""
     shape, repeated = checks.shape_or_none(rigid), repeated_errors(rigid)
-    if findings := list(_of_target(shape, rigid, board)):
+    if findings := list(_of_target(shape, rigid, bends=True)):
         return findings
     if repeated > Limits.repeated_remark:
         return [Finding("remark", f"{_REPEATED.format(repeated)}{_ESTIMATED}.")]
@@ -682,12 +675,12 @@ _ESTIMATED = "; its shape is estimated along with the camera"
 
 
 def _of_target(
-    found: checks.TargetShape | None, calibration: bundle.Calibration, board: str = "rigid"
+    found: checks.TargetShape | None, calibration: bundle.Calibration, bends: bool = False
 ) -> Iterator[Finding]:
-    """Squares that are square, on a board that is flat."""
+    """Squares that are square, on a board that is flat, or `bends` to the shape that is estimated for it."""
     if found is None:
         return
-    off, bends = abs(found.aspect), board != "rigid"
+    off = abs(found.aspect)
     allowed = _ESTIMATED if bends else "; sigma allows for it" if found.allowed else ""
     squares = (
         f"the board's squares are {1 + found.aspect:.3f} times as high as wide "
