@@ -7,14 +7,15 @@
     rig.save("rig.yaml")
 
 Each verb of the command line is a function here: it takes paths (or a pattern), the rig, and the verb's
-options in SI units, and returns the section of rig.yaml with its verdict. Names are loaded when they are
-first used.
+options in SI units or as text with a unit, and returns the section of rig.yaml with its verdict. No file
+has it until `save`. Names are loaded when they are first used.
 """
 
 from __future__ import annotations
 
 import importlib
-from types import SimpleNamespace
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 from calib.core import __version__ as __version__
@@ -59,18 +60,42 @@ def __getattr__(name: str) -> Any:
     if name in _PLACES:
         module, _, attribute = _PLACES[name].partition(":")
         value: Any = getattr(importlib.import_module(module), attribute)
-    elif name in __all__:
-        from calib.stages import STAGES, function
+        if inspect.isfunction(value):
+            from calib.core.arguments import checked
 
-        alone = _BY_DEFAULT.get(name, name)
-        value = function(alone) if alone in STAGES else SimpleNamespace()
-        # Verbs of two words: `calib.imu.static` is `calib imu static`.
-        for one in STAGES:
-            if one.startswith(f"{name} "):
-                setattr(value, one.split()[-1], function(one))
+            value = checked(value, name)
+    elif name in __all__:
+        value = _verb(name)
     else:
         raise AttributeError(f"module 'calib' has no attribute {name!r}")
     globals()[name] = value
+    return value
+
+
+def _verb(name: str) -> Callable[..., Any]:
+    """The function of a verb, with those of two words: `calib.imu.static` is `calib imu static`."""
+    from calib.stages import STAGES, function
+
+    members = {one.split()[-1]: function(one) for one in STAGES if one.startswith(f"{name} ")}
+    alone = _BY_DEFAULT.get(name, name)
+
+    def choose(*args: Any, **options: Any) -> Any:
+        from calib.core.errors import UsageError
+
+        del args, options
+        names = ", ".join(f"calib.{name}.{one}" for one in members)
+        raise UsageError(f"calib.{name} is no function by itself; call one of {names}")
+
+    value = function(alone) if alone in STAGES else choose
+    value.__name__ = value.__qualname__ = name
+    lines = [
+        value.__doc__ or "The functions of this name.",
+        *(["", "    Functions", "    ---------"] if members else []),
+    ]
+    for one, made in members.items():
+        lines.append(f"    calib.{name}.{one} : {(made.__doc__ or '').splitlines()[0]}")
+        setattr(value, one, made)
+    value.__doc__ = "\n".join(lines)
     return value
 
 

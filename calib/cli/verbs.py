@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 from calib.cli import common
 from calib.core.errors import EXIT_POOR
 from calib.core.files import shown
-from calib.core.options import LogOptions, options_of
+from calib.core.options import LogOptions, flag_of, options_of
 from calib.core.stage import AnyStage, Files
 from calib.core.words import as_text
 from calib.stages import STAGES, stage
@@ -81,7 +81,7 @@ def _switches(options: type[Any]) -> Iterator[inspect.Parameter]:
         meta, default = one.metadata, None if one.default is MISSING else one.default
         # What has a parser is typed with its unit, and has its default in the help's words.
         shape: Any = str | None if meta["parse"] is not None else _several(hints[one.name])
-        name = "--" + (meta["flag"] or one.name.replace("_", "-"))
+        name = f"--{flag_of(one)}"
         if hints[one.name] == bool | None:
             # Left open it is neither.
             name += f"/--no-{name.removeprefix('--')}"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
+from calib.core.arguments import taken
 from calib.core.errors import UsageError
+from calib.core.units import unit_of
 
 
 def option(
@@ -16,7 +18,7 @@ def option(
     *,
     flag: str = "",
     metavar: str = "",
-    parse: Callable[[str], Any] | None = None,
+    parse: Callable[[str, str], Any] | None = None,
     least: int | None = None,
 ) -> Any:
     """A field of a stage's options.
@@ -24,7 +26,7 @@ def option(
     Parameters
     ----------
     words : help for the command line and the manual. flag : its name there, where it is not the field's.
-    parse : reads text with a unit into SI; a value that is no text is taken as it is.
+    parse : reads text with a unit into SI, and says in its errors what the text is given as.
     least : smallest value of a number.
     """
     meta = {"words": words, "flag": flag, "metavar": metavar, "parse": parse, "least": least}
@@ -82,10 +84,15 @@ class NoOptions:
     """A stage without options."""
 
 
-def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
+def options_of(kind: type[Any], values: Mapping[str, Any], function: str = "") -> Any:
     """Options of this class from a verb's or a caller's values, texts parsed.
 
-    Raises `UsageError` for a name that is none, with the nearest one, and for a number that no text could be.
+    Parameters
+    ----------
+    function : whose keywords they are, for sentences; without one they are named as on the command line.
+
+    Raises `UsageError` for a name that is none, with the nearest one, for a value of another type, and for a
+    number that no text could be.
     """
     known = {one.name: one for one in fields(kind)}
     hints = get_type_hints(kind)
@@ -96,30 +103,38 @@ def options_of(kind: type[Any], values: Mapping[str, Any]) -> Any:
 
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean {near[0]}?" if near else f", expected one of {', '.join(known)}"
-            raise UsageError(f"{name} is not an option{hint}")
-        choices = [part for one in (hints[name], *get_args(hints[name])) if get_origin(one) is Literal
-                   for part in get_args(one)]  # fmt: skip
-        if choices and value is not None and value not in choices:
-            raise UsageError(f"{name} is {value!r}, expected one of {', '.join(map(str, choices))}")
-        parse = known[name].metadata.get("parse") or (Path if Path in get_args(hints[name]) else None)
-        unit = _UNITS.get(name.rpartition("_")[2])
-        if parse and unit and isinstance(value, int | float):
-            try:
-                parse(f"{value!r}{unit}")
-            except UsageError as error:
-                _, _, why = str(error).partition("' ")
-                raise UsageError(f"{name}={value!r} {why}") from error
-        parsed[name] = parse(value) if parse is not None and isinstance(value, str) else value
+            raise UsageError(f"{function}{': ' * bool(function)}{name} is not an option{hint}")
+        parse, least = (known[name].metadata[key] for key in ("parse", "least"))
+        flag = f"--{flag_of(known[name])}"
+        what = f"{function}: {name}" if function else flag
+        if parse and isinstance(value, str):
+            parsed[name] = parse(value, what)
+            continue
+        unit = unit_of(name)
+        or_words = f"{f' ({unit})' * bool(unit)} or text as for {flag}" if parse else ""
+        found = parsed[name] = taken(value, hints[name], what, or_words)
+        if least is not None and found < least:
+            raise UsageError(f"{what} is {found}, expected at least {least}")
+        if parse and found is not None:
+            parse(_typed(found, unit), what)
     return kind(**parsed)
 
 
-_UNITS = {"m": "m", "hz": "Hz", "kg": "kg"}
-"""Units of numbers by the ending of their names."""
+def _typed(value: float | tuple[Any, ...], unit: str) -> str:
+    """A value as a person would type it, so that its parser can refuse it."""
+    if not isinstance(value, tuple):
+        return f"{value!r}{unit}"
+    return ("" if isinstance(value[-1], str) else ",").join(map(str, value))
+
+
+def flag_of(option: Field[Any]) -> str:
+    """Name of an option on the command line."""
+    return option.metadata["flag"] or option.name.replace("_", "-")
 
 
 def name_of_flag(kind: type[Any], flag: str) -> str:
     """Name of the option that has this flag on the command line. Raises `UsageError` where there is none."""
     for one in fields(kind):
-        if flag == (one.metadata["flag"] or one.name.replace("_", "-")):
+        if flag == flag_of(one):
             return one.name
     raise UsageError(f"--{flag} is not an option")

@@ -25,6 +25,7 @@ import yaml
 from pydantic import BaseModel, Field, field_validator
 
 from calib.core import __version__
+from calib.core.arguments import checked, taken
 from calib.core.errors import BadInputError, NoSectionError, UsageError
 from calib.core.files import one_line, quoted, read_yaml_mapping, sha256, shown
 from calib.core.result import Result, Section, identity, section_json
@@ -178,6 +179,7 @@ class Rig:
         object.__setattr__(self, name, value)
 
     @staticmethod
+    @checked
     def load(path: Path | str, missing_ok: bool = False) -> Rig:
         """The rig in this file; with `missing_ok` an empty one where there is no file.
 
@@ -288,6 +290,7 @@ class Rig:
         }
         return {**self.provenance.inputs, **carried}
 
+    @checked
     def save(self, path: Path | str, inputs: Mapping[str, Mapping[str, str]] | None = None) -> None:
         """Replace the file atomically. Raises `BadInputError`, as `load` where something else is there.
 
@@ -356,7 +359,7 @@ class Rig:
         """What differs in a later calibration, in standard deviations and on the plane."""
         from calib.core.diff import compared, plane_change
 
-        check_rig(other)
+        taken(other, Rig, "calib.Rig.diff: other")
         plane = None
         # Pictures of two sizes have no pixels in common.
         alike = self.picture_px == other.picture_px
@@ -527,14 +530,6 @@ class Rig:
         ]
         no_better = [f"{', '.join(poor)}; what follows from it is no better"] if poor else []
         return [*no_better, *self.outdated(sections)]
-
-
-def check_rig(value: object) -> None:
-    """Raise `UsageError` for what is no rig, such as the name of its file."""
-    if not isinstance(value, Rig):
-        raise UsageError(
-            f"found a rig of type {type(value).__name__}, expected calib.Rig, as of calib.Rig.load(path)"
-        )
 
 
 def _said(section: BaseModel) -> str:

@@ -28,6 +28,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from calib.core.arguments import checked
 from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
 from calib.core.files import check_readable, is_bag, one_line, shown, to_be
@@ -97,10 +98,12 @@ class Log:
         return len(self.t_s)
 
     @staticmethod
+    @checked
     def load(path: str | Path, options: LogOptions = NOTHING_STATED) -> Log:
         """The log of a file: CSV, Parquet, a bag. Raises `BadInputError` as `read_log`."""
         return read_log(Path(path), options)
 
+    @checked
     def save(self, path: str | Path) -> None:
         """Write as .csv or .parquet; never over a recording. Raises `BadInputError`."""
         write_log(Path(path), self, SIMULATED if set(TRUE) & set(self.columns) else LOG)

@@ -38,7 +38,6 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from calib.core import plot
 from calib.core.arrays import FloatArray
-from calib.core.errors import UsageError
 from calib.core.plot import (
     STEEP,
     WIDTH_IN,
@@ -147,12 +146,10 @@ def draw(figure: Figure) -> Drawing:
 def plots(result: Result) -> dict[str, Drawing]:
     """The figures of a result by their names, drawn: `plots(rig.camera)["coverage"]`.
 
-    Raises `BadInputError` for a section that was read from a file, and `UsageError` for what is no section.
+    Raises `BadInputError` for a section that was read from a file.
     """
     from calib.stages import stage
 
-    if not isinstance(result, Result):
-        raise UsageError(f"plots: found {type(result).__name__}, expected a result such as rig.camera")
     # Reading the evidence first says so where there is none.
     made = stage(result.stage) if result.evidence is not None and result.stage else None
     figures = {} if made is None or made.plots is None else made.plots(result)

@@ -14,6 +14,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calib.core.arguments import taken
 from calib.core.command import one_command
 from calib.core.errors import BadInputError, SomeFailedError, UsageError
 from calib.core.options import options_of
@@ -76,27 +77,26 @@ def function(name: str) -> Callable[..., Any]:
 
     Of a stage that answers for each file by itself it is a list, or the one result of one file.
     """
-    made = stage(name)
+    made, told = stage(name), f"calib.{name.replace(' ', '.')}"
     streams = made.output is not None and made.output.write is None
 
     def call(
         sources: str | Path | Sequence[str | Path] | None = None, rig: Rig | None = None, **options: Any
     ) -> Any:
-        from calib.core.rig import Rig, check_rig
+        from calib.core.rig import Rig
 
-        rig = Rig() if rig is None else rig
-        check_rig(rig)
-        output = options.pop("output", None) if streams else None
+        rig = Rig() if rig is None else taken(rig, Rig, f"{told}: rig")
+        output = taken(options.pop("output", None), Path | None, f"{told}: output") if streams else None
         paths = expanded(sources)
         if made.sources and not made.optional and not paths:
-            raise UsageError(f"{name}: found no paths; it takes: {made.sources}")
+            raise UsageError(f"{told}: found no paths; it takes: {made.sources}")
         files = Files(
             paths,
-            output=None if output is None else Path(output),
+            output=output,
             narrate=logging.getLogger("calib").info,
         )
         with one_command(files.paths):
-            outcome = made.run(files, rig, options_of(made.options, options))
+            outcome = made.run(files, rig, options_of(made.options, options, told))
         try:
             files.finish()
         except SomeFailedError as error:
@@ -121,9 +121,11 @@ def function(name: str) -> Callable[..., Any]:
     if made.sources:
         parameters.insert(0, kind("sources", kind.POSITIONAL_OR_KEYWORD, default=kind.empty))
     options = "\n".join(f"    {one.name} : {one.metadata['words']}" for one in fields(made.options))
-    public.__name__ = public.__qualname__ = name.split()[-1]
+    public.__name__, public.__qualname__ = name.split()[-1], name.replace(" ", ".")
+    public.__module__ = "calib"
     public.__doc__ = made.summary.rstrip() + (
-        f"\n\n    Options\n    -------\n{options}\n    " if options else ""
+        f"\n\n    Returns the result; the file and the exit code are those of `calib {name}` alone."
+        + (f"\n\n    Options\n    -------\n{options}\n    " if options else "")
     )
     public.__signature__ = inspect.Signature(parameters)
     made_function: Callable[..., Any] = public

@@ -234,6 +234,15 @@ def _close_loop(
     return pwm, seen
 
 
+def ticks_in(duration_s: float, tick_s: float) -> int:
+    """Ticks of a run. Raises `BadInputError` for none, and for a run of more than `LONGEST_S`."""
+    if not 0.5 * tick_s < duration_s < LONGEST_S + 0.5 * tick_s:
+        raise BadInputError(
+            f"duration: found {duration_s:g} s, expected {tick_s:.3g} s (one tick) to {LONGEST_S:g} s"
+        )
+    return round(duration_s / tick_s)
+
+
 def simulate(
     rig: SimulatedRig,
     start: RigState,
@@ -255,16 +264,13 @@ def simulate(
 
     Raises
     ------
-    BadInputError for a start without lengths, parameters too stiff for the step, a motion that leaves
-    the model, and a run of more than `LONGEST_S`.
+    BadInputError as `ticks_in`, and for a start without lengths, parameters too stiff for the step, and a
+    motion that leaves the model.
     """
     if feedback not in FEEDBACKS:
         raise BadInputError(f"feedback: found {feedback!r}, expected one of {', '.join(FEEDBACKS)}")
     tick_s = rig.pump.tick_s
-    if not 1 <= ticks <= LONGEST_S / tick_s:
-        raise BadInputError(
-            f"duration: found {ticks * tick_s:g} s, expected {tick_s:.3g} s (one tick) to {LONGEST_S:g} s"
-        )
+    ticks_in(ticks * tick_s, tick_s)
     check_start(start.row)
     body = rig.plant if plant is None else plant
     moving = _Plant(rig, body)

@@ -274,9 +274,10 @@ def test_words_that_are_not_known(name: str, options: dict[str, str], words: str
     [
         ("swing", {"length_m": "-0.065"}, "expected positive lengths"),
         ("elongation", {"start_m": "-0.01"}, "expected positive lengths"),
+        ("prbs", {"duration_s": "1e9"}, "duration: found 1e\\+09 s, expected 0.0167 s .one tick. to 7200 s"),
         ("steps", {"volts": "99"}, "found 99 V for a motor, expected 0 to 12, its supply"),
     ],
 )
 def test_numbers_that_no_experiment_can_have(name: str, options: dict[str, str], words: str) -> None:
     with pytest.raises(BadInputError, match=words):
-        run_scenario(make_scenario(name, options), RIG, 0, "truth", 1.0)
+        run_scenario(make_scenario(name, {"duration_s": "1"} | options), RIG, 0, "truth")

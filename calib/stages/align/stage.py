@@ -27,7 +27,7 @@ class AlignOptions(LogOptions):
         "Marker beyond the head, such as 15mm, measured to 1 mm.",
         flag="marker-offset",
         metavar="LENGTH",
-        parse=lambda text: parse_length_m(text, "--marker-offset"),
+        parse=parse_length_m,
     )
 
 

@@ -45,7 +45,7 @@ _duration = partial(
     None,
     "Length of a reference by name, such as 30s.",
     flag="duration",
-    parse=partial(parse_duration_s, what="--duration"),
+    parse=parse_duration_s,
 )
 
 
@@ -399,7 +399,7 @@ class TuneOptions:
         math.pi / 3.0,
         "Least phase margin, such as 60deg. [default: 60deg]",
         flag="phase-margin",
-        parse=partial(parse_angle_rad, what="--phase-margin"),
+        parse=parse_angle_rad,
     )
     sensitivity: float = option(2.0, "Greatest peak of the sensitivity.")
     pwm_limits: tuple[float, float] | None = _limits()

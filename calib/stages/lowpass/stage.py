@@ -43,7 +43,7 @@ class Options(LogOptions):
         "Frequency at which half the power is left. [default: 1Hz]",
         flag="cutoff",
         metavar="FREQUENCY",
-        parse=partial(parse_frequency_hz, what="--cutoff"),
+        parse=parse_frequency_hz,
     )
     rate_hz: float | None = option(
         None,
@@ -51,7 +51,7 @@ class Options(LogOptions):
         "where the log's camera has another, the camera's]",
         flag="rate",
         metavar="FREQUENCY",
-        parse=partial(parse_frequency_hz, what="--rate"),
+        parse=parse_frequency_hz,
     )
     order: int | None = option(None, "1 to 8. [default: 1; with --suggest the one of least delay]")
     family: Literal["butterworth", "bessel", "critical", "chebyshev1", "chebyshev2", "elliptic"] | None = (
