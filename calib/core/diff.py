@@ -22,6 +22,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.constants import Constant, constants
 from calib.core.geometry import box_grid
+from calib.core.words import Block, InWords, Line, Table, number, several
 
 Sections = Mapping[str, Mapping[str, Any]]
 
@@ -69,8 +70,12 @@ class PlaneChange:
     significant: bool | None
 
 
-@dataclass(frozen=True)
-class RigDiff:
+_SHOWN = 20
+"""Constants, and names in a sentence, that the words tell unless asked for all."""
+
+
+@dataclass(frozen=True, repr=False)
+class RigDiff(InWords):
     """All that differs between two calibrations.
 
     Attributes
@@ -96,6 +101,71 @@ class RigDiff:
     other_inputs: tuple[str, ...]
     compared: int
     significant: bool
+
+    def blocks(self, every: bool = False) -> Iterator[Block]:
+        """In words: the foremost constants that differ, or every one."""
+        both = [c for c in self.changes if c.before is not None and c.after is not None]
+        yield Line(f"{self.compared} constants are in both, {len(both)} of them differ")
+        rows = [_row(change) for change in (both if every else both[:_SHOWN])]
+        if rows:
+            yield Table(("constant", "before", "after", "difference", "unit", "in sigma", ""), tuple(rows))
+        if len(rows) < len(both):
+            yield Line(f"  {len(both) - len(rows)} more (--all shows them)")
+        alone = [
+            c
+            for c in self.changes
+            if c.section.partition(".")[0] not in (*self.only_before, *self.only_after)
+        ]
+        for words, names in (
+            (
+                "only before",
+                [*self.only_before, *(f"{c.section}.{c.name}" for c in alone if c.after is None)],
+            ),
+            ("only after", [*self.only_after, *(f"{c.section}.{c.name}" for c in alone if c.before is None)]),
+            ("also different", [f"{section} ({', '.join(keys)})" for section, keys in self.others.items()]),
+            ("learnt from other inputs", self.other_inputs),
+        ):
+            if names:
+                yield Line(f"{words}: {several(names, len(names) if every else _SHOWN)}")
+        for one in self.verdicts:
+            yield Line("verdict of {section}: {before} before, {after} after".format(**one))
+        plane = self.plane
+        if self.pictures_px is not None:
+            before, after = ("x".join(map(str, size)) for size in self.pictures_px)
+            yield Line(
+                f"the cameras have pictures of two sizes, {before} px before and {after} px after: "
+                "their pixels are not compared, so that there is no difference in millimetres"
+            )
+        elif plane is None:
+            yield Line(
+                "no plane in both, or none of the workspace in the picture: no difference in millimetres"
+            )
+        else:
+            bar = "" if not plane.sigma_mm else f", sigma {plane.sigma_mm:.4f} mm"
+            yield Line(
+                f"a marker in the workspace is read {plane.mean_mm:.4f} mm elsewhere on average, "
+                f"{plane.largest_mm:.4f} mm at most{bar}: {_judged(plane.significant)}"
+            )
+        bare = sum(change.significant is None for change in both)
+        also = f"; {bare} without error bars differ{'s' * (bare == 1)}" if bare else ""
+        yield Line(f"in all: {'significant' if self.significant else 'nothing beyond the error bars'}{also}")
+
+
+def _row(change: Change) -> tuple[str, ...]:
+    assert change.before is not None and change.after is not None
+    return (
+        f"{change.section}.{change.name}",
+        number(change.before, change.sigma),
+        number(change.after, change.sigma),
+        f"{change.after - change.before:+.3g}",
+        change.unit,
+        "-" if change.sigmas is None else f"{change.sigmas:.1f}",
+        _judged(change.significant),
+    )
+
+
+def _judged(significant: bool | None) -> str:
+    return "no error bars" if significant is None else "significant" if significant else "not significant"
 
 
 def compared(a: Sections, b: Sections, plane: PlaneChange | None) -> RigDiff:

@@ -30,7 +30,7 @@ from calib.core.errors import BadInputError, NoSectionError, UsageError
 from calib.core.files import one_line, quoted, read_yaml_mapping, sha256, shown
 from calib.core.result import Result, Section, identity, section_json
 from calib.core.schema import nearest, validated
-from calib.core.words import Block, Table, as_html, as_text
+from calib.core.words import Block, InWords, Table
 from calib.core.writing import Kind, head, write_atomically
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _section_text(name: str, document: str) -> str:
 
 
 @dataclass(repr=False)
-class Rig:
+class Rig(InWords):
     """The whole file, its sections as attributes; None for one that it has not.
 
     `schema` is the version of the file that it was read from.
@@ -324,19 +324,13 @@ class Rig:
         found = {name: getattr(self, name) for name in KINDS if name != "provenance"}
         return {name: one for name, one in found.items() if one is not None}
 
-    def _overview(self) -> list[Block]:
+    def blocks(self) -> list[Block]:
+        """Sections and their verdicts; each section shows its own values."""
         rows = [
             (name, one.verdict.word if isinstance(one, Result) else "stated")
             for name, one in self.sections.items()
         ]
         return [Table(("section", "verdict"), tuple(rows))]
-
-    def __repr__(self) -> str:
-        """Sections and their verdicts; each section shows its own values."""
-        return "\n".join(as_text(self._overview()))
-
-    def _repr_html_(self) -> str:
-        return as_html(self._overview())
 
     def only(self, names: Iterable[str]) -> Rig:
         """The sections of these names, and what they were learnt from."""

@@ -95,6 +95,10 @@ class Verdict:
         """As the terminal shows it."""
         return "\n".join(LEADS.get(kind, "") + text for kind, text in self.lines)
 
+    def __repr__(self) -> str:
+        """The words of `str`: what a person sees who types a verdict's name."""
+        return str(self)
+
     @property
     def lines(self) -> list[tuple[str, str]]:
         """Kind and text: the word, then the reasons, the remarks and the advice."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -85,6 +85,20 @@ def short(value: float) -> str:
     if isinstance(value, int) or (value == round(value) and abs(value) < 1e7):
         return str(round(value))
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
+class InWords:
+    """A value that a person who types its name sees in words, in a notebook as tables."""
+
+    def blocks(self) -> Iterable[Block]:
+        """The words."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return "\n".join(as_text(list(self.blocks())))
+
+    def _repr_html_(self) -> str:
+        return as_html(list(self.blocks()))
 
 
 def described(result: BaseModel) -> list[Block]:

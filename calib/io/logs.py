@@ -36,7 +36,8 @@ from calib.core.geometry import in_picture
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity
-from calib.core.words import all_of, several
+from calib.core.words import BLANK, InWords, Line, Table, all_of, counted, several
+from calib.core.words import Block as Words
 from calib.core.writing import Kind, column_names, write_atomically
 from calib.io.columns import (
     ACCEL,
@@ -71,8 +72,8 @@ _WRAPS_WITHIN = 20.0
 _BEGINNING = 1000
 
 
-@dataclass(frozen=True)
-class Log:
+@dataclass(frozen=True, repr=False)
+class Log(InWords):
     """Rows of a log in SI.
 
     Attributes
@@ -96,6 +97,19 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.t_s)
+
+    def blocks(self) -> list[Words]:
+        """Length, and of each column how many readings it has, the least and the greatest."""
+        span = (
+            f", {np.nanmin(self.t_s):g} to {np.nanmax(self.t_s):g} s" if np.isfinite(self.t_s).any() else ""
+        )
+        rows = []
+        for name, column in self.columns.items():
+            there = column[np.isfinite(column)]
+            ends = (f"{end:.6g}" for end in (there.min(), there.max())) if len(there) else (BLANK, BLANK)
+            rows.append((name, str(len(there)), *ends))
+        table = Table(("column", "readings", "least", "greatest"), tuple(rows))
+        return [Line(f"{one_line(self.source)}: {counted(len(self), 'row')}{span}"), table]
 
     @staticmethod
     @checked
@@ -593,7 +607,7 @@ _STUCK_S, _SHAKEN_RAD = 1.0, 0.1
 """A reading that stays the same for so long while the accelerometer is shaken by 0.1 g."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Signals:
     """Readings of some columns of a log, sample by sample.
 
@@ -619,6 +633,9 @@ class Signals:
 
     def __len__(self) -> int:
         return len(self.stamps_s)
+
+    def __repr__(self) -> str:
+        return f"{one_line(self.source)}: {counted(len(self), 'reading')} of {', '.join(self.names)}"
 
     def __getitem__(self, name: str) -> FloatArray:
         return np.ascontiguousarray(self.values[:, self.names.index(name)])

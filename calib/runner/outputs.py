@@ -14,6 +14,7 @@ from calib.core.errors import EXIT_DONE, BadInputError
 from calib.core.files import VIDEOS, file_sha256, one_line, sha256, shown
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.rig import Rig
+from calib.core.words import Block, InWords, Line
 from calib.core.workers import processors
 from calib.core.writing import make_folder, replacing, write_atomically
 from calib.io.columns import read_columns_file
@@ -164,8 +165,8 @@ def _copy(source: Path, target: Path) -> None:
 # A whole rig: a folder in; its results, a page and the decision out.
 
 
-@dataclass(frozen=True)
-class Calibrated:
+@dataclass(frozen=True, repr=False)
+class Calibrated(InWords):
     """A run that has ended.
 
     Attributes
@@ -179,6 +180,13 @@ class Calibrated:
     told: dict[str, Any]
     ended: Sequence[Job]
     files: tuple[str, ...]
+
+    def blocks(self) -> list[Block]:
+        return [
+            Line(f"can it be flashed? {self.decision.answer}: {self.decision.headline}"),
+            *(Line(sentence, "reason") for sentence in self.decision.weak),
+            *(Line(sentence, "advice") for sentence in self.decision.record),
+        ]
 
     @property
     def rig(self) -> Rig:

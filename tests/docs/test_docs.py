@@ -118,7 +118,10 @@ def test_the_tour_runs_as_in_a_notebook(tmp_path: Path, monkeypatch: pytest.Monk
     assert Path("firmware_constants/calib_constants.h").is_file()
     header = names["calib"].firmware(rig)
     assert pickle.loads(pickle.dumps(header)) == header
-    assert "<table>" in rig.camera._repr_html_()
+    assert "<table>" in rig.camera._repr_html_() and "<table>" in names["log"]._repr_html_()
+    assert repr(names["log"]).startswith("ellipse: 1280 rows, 0 to 7.99")
+    for one in (names["log"], header, rig.diff(saved), rig.camera.verdict, header.verdict):
+        assert len(repr(one)) < 1500 and type(one).__name__ not in repr(one)
     assert set(names["calib"].plots(states)) == {
         f"ellipse_{one}" for one in ("states", "innovations", "errors")
     }

@@ -13,7 +13,7 @@ from calib.core.files import shown
 from calib.core.options import PoseOptions, option
 from calib.core.stage import Files, Stage, later
 from calib.core.verdict import Verdict
-from calib.core.words import BLANK, Block, Line, Table, number
+from calib.core.words import BLANK, Block, InWords, Line, Table, number
 from calib.stages import expanded
 
 if TYPE_CHECKING:
@@ -431,8 +431,8 @@ class ValidateOptions(PoseOptions):
     day: tuple[str, ...] | None = option(None, "Day of an arm's logs.", metavar="NAME=DAY")
 
 
-@dataclass(frozen=True)
-class Validated:
+@dataclass(frozen=True, repr=False)
+class Validated(InWords):
     """What models show in place of logs.
 
     Attributes
@@ -446,6 +446,9 @@ class Validated:
     inside: Mapping[str, float] = field(default_factory=dict)
     interval_rad: float = math.nan
     verdict: Verdict = Verdict()
+
+    def blocks(self) -> list[Block]:
+        return _validate_words(self)
 
 
 def _read_validate(

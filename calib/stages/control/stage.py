@@ -14,7 +14,7 @@ from calib.core.options import option
 from calib.core.stage import Files, Output, Stage, later
 from calib.core.units import parse_angle_rad, parse_duration_s, parse_pwm_limits
 from calib.core.verdict import Finding, Verdict
-from calib.core.words import BLANK, Block, Line, Table, of_verdict
+from calib.core.words import BLANK, Block, InWords, Line, Table, of_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -98,8 +98,8 @@ class RunOptions:
     )
 
 
-@dataclass(frozen=True)
-class Runs:
+@dataclass(frozen=True, repr=False)
+class Runs(InWords):
     """How well controllers follow a reference.
 
     Attributes
@@ -112,6 +112,9 @@ class Runs:
     follow: Following
     outcomes: Sequence[Outcome]
     options: RunOptions
+
+    def blocks(self) -> list[Block]:
+        return _run_words(self)
 
     @property
     def verdict(self) -> Verdict:
@@ -252,8 +255,8 @@ class CheckOptions:
     pwm_limits: tuple[float, float] | None = _limits()
 
 
-@dataclass(frozen=True)
-class Checked:
+@dataclass(frozen=True, repr=False)
+class Checked(InWords):
     """Whether the pumps can follow a reference.
 
     Attributes
@@ -269,6 +272,9 @@ class Checked:
     slower: Reference | None = None
     moved_m: float = 0.0
     never: str = ""
+
+    def blocks(self) -> list[Block]:
+        return _check_words(self)
 
     @property
     def verdict(self) -> Verdict:

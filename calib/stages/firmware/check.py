@@ -17,6 +17,7 @@ from pathlib import Path
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
 from calib.core.verdict import Finding, Verdict
+from calib.core.words import Block, InWords, Line, Table, counted, of_verdict
 from calib.io.serial import BOARD_COLUMNS, FAULTS, GUARD_RUN, Frame, Outputs, frame_from_row
 from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, MARKER_HELD, reference_of
 from calib.stages.firmware.header import Header
@@ -27,8 +28,8 @@ _UNDECIDED_M = 1e-6
 """What rounding makes of the fused estimator's residuals after a long rest."""
 
 
-@dataclass(frozen=True)
-class Check:
+@dataclass(frozen=True, repr=False)
+class Check(InWords):
     """How far a board was from the reference.
 
     Attributes
@@ -47,6 +48,13 @@ class Check:
     flags_differ: int
     first_bad: tuple[int, str] | None
     faults: dict[int, int]
+
+    def blocks(self) -> list[Block]:
+        rows = tuple(
+            (name, f"{worst:.2g}", f"{self.allowed[name]:.2g}") for name, worst in self.worst.items()
+        )
+        head = ("", "differs at most", "allowed")
+        return [Line(f"{counted(self.ticks, 'tick')} compared"), Table(head, rows), *of_verdict(self.verdict)]
 
     @property
     def verdict(self) -> Verdict:

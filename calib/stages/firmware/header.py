@@ -10,7 +10,7 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -25,6 +25,7 @@ from calib.core.errors import BadInputError
 from calib.core.result import identity
 from calib.core.rig import KINDS, VERBS
 from calib.core.verdict import Finding, Verdict
+from calib.core.words import Block, InWords, Line, of_verdict
 from calib.core.writing import Kind, begins, make_folder, write_atomically
 from calib.stages.camera.lens import fit_inverse
 from calib.stages.camera.model import COEFFICIENTS, MODELS
@@ -112,8 +113,8 @@ _INVERSE_SHARE = 0.9
 """A header is marked when its polynomial undoes the lens worse than this, or in less of the picture."""
 
 
-@dataclass(frozen=True)
-class Header:
+@dataclass(frozen=True, repr=False)
+class Header(InWords):
     """calib_constants.h, and the files around it.
 
     Attributes
@@ -124,10 +125,13 @@ class Header:
     verdict : of the sections that the constants come from.
     """
 
-    text: str = field(repr=False)
-    literals: Mapping[str, str] = field(repr=False)
+    text: str
+    literals: Mapping[str, str]
     digest: str
     verdict: Verdict
+
+    def blocks(self) -> list[Block]:
+        return [Line(f"{len(self.literals)} constants"), *of_verdict(self.verdict)]
 
     @cached_property
     def values(self) -> Mapping[str, float]:

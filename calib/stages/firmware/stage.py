@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from calib.core.files import shown
 from calib.core.options import option
 from calib.core.stage import Files, Output, Stage
-from calib.core.words import Block, Line, Table, of_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -89,18 +88,6 @@ def _document(outcome: Header | Check) -> dict[str, Any]:
     }
 
 
-def _words(outcome: Header | Check) -> list[Block]:
-    from calib.stages.firmware.header import Header
-
-    if isinstance(outcome, Header):
-        return [Line(f"{len(outcome.literals)} constants"), *of_verdict(outcome.verdict)]
-    rows = tuple(
-        (name, f"{worst:.2g}", f"{outcome.allowed[name]:.2g}") for name, worst in outcome.worst.items()
-    )
-    head = ("", "differs at most", "allowed")
-    return [Line(f"{outcome.ticks} ticks compared"), Table(head, rows), *of_verdict(outcome.verdict)]
-
-
 firmware = Stage(
     "firmware",
     "Firmware",
@@ -118,5 +105,5 @@ firmware = Stage(
         "Folder to write into.", _write, default=Path("firmware_constants"), folder=True
     ),
     document=_document,
-    words=_words,
+    words=lambda outcome: outcome.blocks(),
 )  # fmt: skip
