@@ -53,6 +53,7 @@ def quantity(
     label: str,
     show: str = "",
     digits: int | None = None,
+    digits_by: str = "",
     fact: bool | tuple[str | int, ...] = False,
     **limits: Any,
 ) -> Any:
@@ -63,11 +64,12 @@ def quantity(
     label : words for terminal, page and manual.
     show : unit to show it in, where that is not the unit of the file ("ms" of a time, "deg" of an angle).
     digits : digits behind the point where there is no standard deviation to say how many.
+    digits_by : key beside it with the standard deviation that says how many, in a table of parts.
     fact : whether it stands at the head of its stage on the page; of a list or mapping which items do.
     limits : `ge`, `gt`, `le`, `lt` as in pydantic.
     """
     shown = list(fact) if isinstance(fact, tuple) else fact
-    extra: dict[str, Any] = {"show": show, "digits": digits, "fact": shown}
+    extra: dict[str, Any] = {"show": show, "digits": digits, "digits_by": digits_by, "fact": shown}
     return Field(default, title=label, json_schema_extra=extra, **limits)
 
 

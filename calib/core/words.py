@@ -74,10 +74,10 @@ def number(value: float | None, sigma: float | None = None, places: int | None =
         if places < 0 and 0.0 < abs(value) < 1e9:
             # Tens and hundreds that the deviation leaves open are no digits either, but for two of the value.
             places = max(places, 1 - math.floor(math.log10(abs(value))))
-            return f"{round(value, places):.{max(places, 0)}f}"
+            return f"{round(value, places):z.{max(places, 0)}f}"
         if not (0 <= places <= 12 and abs(value) < 1e9):
             places = None
-    return f"{value:.6g}" if places is None else f"{value:.{places}f}"
+    return f"{value:.6g}" if places is None else f"{value:z.{places}f}"
 
 
 def short(value: float) -> str:
@@ -284,12 +284,19 @@ def _vector(
     return out
 
 
-def _cell(value: Any, scale: float, places: int | None) -> str:
-    """A value, or those of a list, of a list of lists with commas between the inner ones."""
+def _cell(value: Any, scale: float, places: int | None, bar: float | None = None) -> str:
+    """A value, or those of a list, of a list of lists with commas between the inner ones.
+
+    `bar` is the deviation that says how many digits they have.
+    """
     if isinstance(value, list):
-        cells = [_cell(one, scale, places) for one in value]
+        cells = [_cell(one, scale, places, bar) for one in value]
         return (", " if any(isinstance(one, list) for one in value) else " ").join(cells)
-    return _word(value) if isinstance(value, bool | str) else number(_scaled(value, scale), None, places)
+    return (
+        _word(value)
+        if isinstance(value, bool | str)
+        else number(_scaled(value, scale), _scaled(bar, scale), places)
+    )
 
 
 def several(names: Sequence[str], most: int = 6) -> str:
@@ -329,8 +336,13 @@ def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
         for key, field in columns.items():
             value = getattr(one, key)
             _, scale, places = _shown(key, field)
-            if isinstance(value, list | bool | str):
-                cells.append(_cell(value, scale, places))
+            by = (
+                field.json_schema_extra.get("digits_by")
+                if isinstance(field.json_schema_extra, dict)
+                else None
+            )
+            if by or isinstance(value, list | bool | str):
+                cells.append(_cell(value, scale, places, getattr(one, str(by), None)))
             else:
                 cells.append(*_vector([value], [_named(sigmas, key)], scale, places))
         rows.append(tuple(cells))

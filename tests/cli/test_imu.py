@@ -150,7 +150,7 @@ def test_gaps_and_repeated_rows_are_handled_and_reported(
     rows = np.sort(np.concatenate([np.delete(np.arange(3000), [1000, 1001]), np.arange(100, 700, 100)]))
     static([_write(tmp_path / "log.csv", _at_rest()[rows], t[rows])], rig=tmp_path / "rig.yaml")
     out = capsys.readouterr().out
-    assert "2 samples missing in 1 gap(s), the longest 30 ms after 9.99 s" in out
+    assert "2 samples missing in 1 gap, the longest 30 ms after 9.99 s" in out
     assert "split at a gap of 3600 s after 19.99 s" in out
     assert "6 rows (0.20%) repeat the one before; dropped" in out
 
@@ -365,7 +365,7 @@ def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path) -
     ended = calib("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
     assert ended.code == 0
     assert "(remark) log.csv: gx_radps never changes, it is stuck at 0.002; left out" in ended.out
-    assert "1 samples missing in 1 gap(s), the longest 20 ms after 9.99 s" in ended.out
+    assert "1 sample missing in 1 gap, the longest 20 ms after 9.99 s" in ended.out
     assert "split at a gap of 3600 s after 19.99 s" in ended.out
     assert "6 rows (0.20%) repeat the one before; dropped" in ended.out
     # The gyroscope alone is begun anew after the hour.
@@ -491,7 +491,7 @@ def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path
     ended = calib("imu", "tune", path, "--rig", tmp_path / "rig.yaml")
     assert ended.code == 0
     assert "6 rows (0.20%) repeat the one before; dropped" in ended.err
-    assert "2 samples missing in 1 gap(s), the longest 30 ms after 6.99 s; filled" in ended.err
+    assert "2 samples missing in 1 gap, the longest 30 ms after 6.99 s; filled" in ended.err
     assert "split at a gap of 3600 s after 14.99 s" in ended.err
     section = Rig.load(tmp_path / "rig.yaml").orientation_filter
     assert section is not None and section.recommended == "levelling"

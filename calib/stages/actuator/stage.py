@@ -12,6 +12,7 @@ from calib.core.errors import UsageError
 from calib.core.files import shown
 from calib.core.options import PoseOptions, option
 from calib.core.stage import Files, Stage, later
+from calib.core.units import unit_of
 from calib.core.verdict import Verdict
 from calib.core.words import BLANK, Block, InWords, Line, Table, number
 from calib.stages import expanded
@@ -109,7 +110,7 @@ def _words(sections: Sections) -> list[Block]:
             label_of(name),
             number(value, known.sigma[name]),
             f"{known.sigma[name]:.2g}",
-            PARAMETERS[name].unit or BLANK,
+            unit_of(name) or BLANK,
             PARAMETERS[name].symbol,
             f"{known.inflation[name] * known.scatter[name]:.1f}",
         )

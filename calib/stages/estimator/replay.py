@@ -32,6 +32,7 @@ from calib.core.rig import Rig
 from calib.core.stage import ProgressCall
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity, Verdict
+from calib.core.words import counted
 from calib.io.columns import BASELINE, STATES, Passed
 from calib.io.logs import Log, Watch
 from calib.io.states import states_writer
@@ -580,11 +581,11 @@ def consistent(
     if flags.get("time_jump"):
         yield Finding("poor", f"jumps of the time: {flags['time_jump']}; the filter starts again after each")
     if flags.get("restarted"):
-        text = f"the filter started again {flags['restarted']} times after rejecting all readings"
+        text = f"the filter started again {counted(flags['restarted'], 'time')} after rejecting all readings"
         yield Finding("remark", text)
     if late := flags.get("late"):
         severity: Severity = "poor" if late > _LATE_SHARE * rows else "remark"
-        yield Finding(severity, f"{late} readings came too late to be used")
+        yield Finding(severity, f"{counted(late, 'reading')} came too late to be used")
 
 
 def contradicting(

@@ -12,6 +12,7 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
+from calib.core.words import counted
 from calib.io.logs import clipped
 from calib.solve.clock import SPLIT_S, Gap, Part, time_axis
 from calib.stages.imu.levelling import GAP_S
@@ -155,7 +156,7 @@ def sampling_findings(
         longest = max(short, key=lambda gap: gap.duration_s)
         yield Finding(
             "poor" if s.missing > _MOST_MISSING * s.samples else "remark",
-            f"{lead}{s.missing} samples missing in {len(short)} gap(s), the longest "
+            f"{lead}{counted(s.missing, 'sample')} missing in {counted(len(short), 'gap')}, the longest "
             f"{1e3 * longest.duration_s:.3g} ms after {longest.at_s:.2f} s; filled by straight lines",
         )
     if s.repeated_rows:
@@ -165,13 +166,15 @@ def sampling_findings(
         each = times > 0.5 and abs(times - round(times)) < _UNEQUALLY
         yield Finding(
             "poor" if share > most_repeated and not each else "remark",
-            f"{lead}{s.repeated_rows} rows ({share:.2%}) repeat the one before; dropped",
+            f"{lead}{counted(s.repeated_rows, 'row')} ({share:.2%}) "
+            f"repeat{'s' * (s.repeated_rows == 1)} the one before; dropped",
         )
     if s.repeated_stamps:
         yield Finding(
             "remark",
-            f"{lead}{s.repeated_stamps} time stamps ({s.repeated_stamps / s.samples:.2%}) repeat the one "
-            "before with other readings; counted as samples of their own",
+            f"{lead}{counted(s.repeated_stamps, 'time stamp')} ({s.repeated_stamps / s.samples:.2%}) "
+            f"repeat{'s' * (s.repeated_stamps == 1)} the one before with other readings; counted as "
+            "samples of their own",
         )
 
 
@@ -182,7 +185,7 @@ def limit_findings(s: Sampling, axes: Sequence[str], most: float = 0.0) -> Itera
             poor = count > most * s.samples
             yield Finding(
                 "poor" if poor else "remark",
-                f"{axis} is at the end of its range in {count} samples",
+                f"{axis} is at the end of its range in {counted(count, 'sample')}",
                 "set the sensor to a wider range, or move it more slowly" if poor else "",
             )
 

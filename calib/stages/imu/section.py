@@ -314,10 +314,10 @@ class DriftMethod(Section):
     """
 
     offset_deg: Number | None = quantity(label="offset", digits=3)
-    slope_degps: Number | None = quantity(label="slope", digits=5)
+    slope_degps: Number | None = quantity(label="slope", digits=5, digits_by="sigma_degps")
     sigma_degps: NotNegative | None
     interval_degps: Annotated[list[Number | None], Field(min_length=2, max_length=2)] = quantity(
-        label="95 % interval", digits=5
+        label="95 % interval", digits=5, digits_by="sigma_degps"
     )
     allan_1s_deg: NotNegative | None = quantity(label="Allan 1 s", digits=4)
     allan_100s_deg: NotNegative | None = quantity(label="100 s", digits=4)
@@ -356,8 +356,8 @@ class DriftOfLog(Section):
 class DriftSlopes(Section):
     """Slopes of one method over several logs."""
 
-    mean_degps: Number | None = quantity(label="mean", digits=5)
-    spread_degps: NotNegative | None = quantity(label="spread", digits=5)
+    mean_degps: Number | None = quantity(label="mean", digits=5, digits_by="spread_degps")
+    spread_degps: NotNegative | None = quantity(label="spread", digits=5, digits_by="spread_degps")
     logs: Count = quantity(label="logs")
 
 
