@@ -24,6 +24,7 @@ from calib.stages.camera.checks import (
     best_split,
     evidence,
     overdispersion,
+    scatter_beyond,
     straightened,
     target_shape,
     view_faults,
@@ -598,6 +599,69 @@ def test_overdispersion_sees_errors_shared_by_a_view() -> None:
     ]
     fit = calibrate(pack(bent), (640, 480), "radial2")
     assert overdispersion(evidence(fit)) > 1.5
+
+
+def test_scatter_of_views_along_one_direction_reaches_the_covariance() -> None:
+    """Of views whose focal length scatters, against the variance that such scores have."""
+    fit = _fit_evidence()
+    found, rng, tau_px = evidence(fit), np.random.default_rng(4), 3.0
+    S = np.tile(found.S, (40, 1, 1))
+    zoom = np.isin(found.names, ["fx_px", "fy_px"]) * 1.0
+    noise = np.einsum("ngh,nh->ng", np.linalg.cholesky(S), rng.standard_normal(S.shape[:2]))
+    zoomed = S @ zoom * rng.normal(0.0, tau_px, (len(S), 1))
+    inverse = np.linalg.inv(S.sum(axis=0))
+    for b, extra in ((noise, 0.0), (noise + zoomed, tau_px)):
+        b = b - S @ (inverse @ b.sum(axis=0))
+        made = replace(found, S=S, b=b, cost=np.ones(len(S)), sigma_px=1.0)
+        even = overdispersion(made)
+        known = even**2 * inverse + sum(np.outer(one, one) for one in scatter_beyond(made, even))
+        moved = inverse @ S @ zoom
+        truth = inverse + extra**2 * moved.T @ moved
+        ratio = np.sqrt(np.diag(known) / np.diag(truth))[np.isin(found.names, ["fx_px", "fy_px"])]
+        assert np.all(np.abs(ratio - 1.0) < 0.15), (extra, ratio)
+
+
+PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
+
+
+def _zoomed(v: View, rng: np.random.Generator) -> View:
+    return replace(v, pixels=v.pixels + (v.pixels - [320, 240]) * 0.003 * rng.normal())
+
+
+def _sheared_by_the_shutter(v: View, rng: np.random.Generator) -> View:
+    return replace(v, pixels=v.pixels + (v.pixels[:, 1:] / 480 - 0.5) * 0.5 * rng.normal(size=2))
+
+
+def _stabilised(v: View, rng: np.random.Generator) -> View:
+    return replace(v, pixels=v.pixels + rng.normal(size=2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changed", "noise_px", "least", "most"),
+    [
+        (lambda v, _: v, 0.05, 0.80, 1.10),
+        (_zoomed, 0.05, 0.9, 1.3),
+        (_sheared_by_the_shutter, 0.03, 0.9, 1.7),
+        (_stabilised, 0.03, 0.9, 1.4),
+    ],
+)
+def test_sigma_holds_where_the_camera_changes_from_view_to_view(
+    changed: Any, noise_px: float, least: float, most: float
+) -> None:
+    """Root mean square z of focal lengths and centre over 40 sets of 15 views; prints it."""
+    z = []
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 17])
+        camera = camera_of((640, 480), rng.uniform(45, 80), (rng.uniform(-0.25, 0), rng.uniform(0, 0.1)))
+        views = [changed(v, rng) for v in take(rng, camera, 15, BOARD.points_m(), Recipe(noise_px))]
+        found = calibrate_camera(views, camera.image_size_px)
+        sigma = found.covariance.sigma()
+        off = {name: getattr(found.calibration.camera, name) - getattr(camera, name) for name in PINHOLE}
+        z.extend(off[name] / sigma[name] for name in PINHOLE)
+    rms = float(np.sqrt(np.mean(np.square(z))))
+    print(f"z of {rms:.2f}, {np.mean(np.abs(z) < 2):.0%} within two")
+    assert least < rms < most
 
 
 def _fit_two_cameras(views: list[View], model: str = "radial2") -> Calibration:

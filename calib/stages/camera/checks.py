@@ -646,6 +646,31 @@ def _step(found: Evidence, t: FloatArray, kept: BoolArray | None = None) -> tupl
     return step, bool(np.any(np.abs(step) > CERTAIN * sigma))
 
 
+def scatter_beyond(found: Evidence, inflation: float) -> list[FloatArray]:
+    """One standard deviation each, (P,), of what scatters the views by more than an even inflation allows.
+
+    Autofocus, image stabilisation and a rolling shutter change the camera from view to view, in some
+    directions only. The views' scores, each freed from what its own leverage takes away (Bell and McCaffrey,
+    Survey Methodology 28, 2002), are held against the inflated covariance; what they scatter more along an
+    eigenvector counts, as the mean over these views and as many even ones as there are parameters.
+
+    Parameters
+    ----------
+    found : of the camera, without the target's deformation.
+    inflation : `overdispersion` of it.
+    """
+    views, P = found.b.shape
+    values, vectors = np.linalg.eigh(scaled_inverse(found.S.sum(axis=0)))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    left, Q = np.linalg.eigh(np.eye(P) - root.T @ found.S @ root)
+    score = Q.transpose(0, 2, 1) @ (found.b @ root)[..., None] / np.sqrt(np.maximum(left, 1e-9))[..., None]
+    even = max(inflation * found.sigma_px, 1e-300)
+    score = (Q @ score)[..., 0] / even
+    scatter, directions = np.linalg.eigh(score.T @ score)
+    excess = np.maximum((scatter - 1.0) * views / (views + P), 0.0)
+    return [shift for shift in even * (root @ directions * np.sqrt(excess)).T if shift.any()]
+
+
 TELL_SHAPE = 4
 """Views from which on the board's shape is told from the poses."""
 
@@ -654,18 +679,21 @@ def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
     """The covariance by which the views really scatter.
 
     Blur, print and lens leave errors that are smooth over a view, so that views disagree by more than the
-    noise of their corners would let them: two to three times as much on real pictures. A board that is not
-    as described moves the camera by as much as it would if the board's shape were estimated too, and one that
-    changes from view to view is another by as much.
+    noise of their corners would let them: two to three times as much on real pictures, and more in some
+    directions than in others. A board that is not as described moves the camera by as much as it would if the
+    board's shape were estimated too, and one that changes from view to view is another by as much.
     """
     try:
-        inflation = overdispersion(evidence(calibration, calibration.basis).of_the_camera())
+        found = evidence(calibration, calibration.basis).of_the_camera()
+        inflation = overdispersion(found)
+        shifts = scatter_beyond(found, inflation)
         tells = calibration.basis is None and calibration.observations.views >= TELL_SHAPE
         shape, ran = (shape_or_none(calibration), drift(calibration)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
-        inflation, shape, ran = 1.0, None, None
+        inflation, shifts, shape, ran = 1.0, [], None, None
     variance = (inflation * calibration.sigma_px) ** 2
-    shifts = [shape.shift] if shape is not None and shape.allowed else []
+    if shape is not None and shape.allowed:
+        shifts.append(shape.shift)
     known = bundle.covariance(calibration, variance, shifts)
     if ran is None:
         return known
