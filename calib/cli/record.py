@@ -74,7 +74,9 @@ def record(
         int, typer.Option(min=10, max=100, help="Greatest command of --do, in % of what the envelope allows.")
     ] = 100,
     yes: Annotated[bool, typer.Option("--yes", help="Do not wait for Enter before an experiment.")] = False,
-    duration: Annotated[str | None, typer.Option(help="How long, such as 20s; else until Ctrl-C.")] = None,
+    duration: Annotated[
+        str | None, typer.Option(metavar="TIME", help="How long, such as 20s; else until Ctrl-C.")
+    ] = None,
     ticks: Annotated[int | None, typer.Option(min=1, help="Stop after this many ticks.")] = None,
     baud: Annotated[int, typer.Option(min=300, help="Speed of the port.")] = 115200,
     as_json: JsonOption = False,

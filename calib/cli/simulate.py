@@ -42,11 +42,15 @@ def simulate(
     feedback: Annotated[
         str, typer.Option(help="What controllers get: sensors, filtered as in the firmware, or truth.")
     ] = "sensors",
-    duration: Annotated[str | None, typer.Option(help="Length of the log, such as 10s.")] = None,
+    duration: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Length of the log, such as 10s. [default: the scenario's own]"),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
+            metavar="KEY=VALUE",
             help="Option of the scenario, such as Kp=500; may be repeated. calib docs simulate lists them.",
         ),
     ] = None,

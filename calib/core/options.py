@@ -70,7 +70,9 @@ class PoseOptions(LogOptions):
     """Where the pose comes from."""
 
     states: tuple[Path, ...] | None = option(
-        None, "States of calib replay to use instead of the pictures, for the logs in turn."
+        None,
+        "States of calib replay to use instead of the pictures, for the logs in turn.",
+        metavar="STATES",
     )
     truth: bool = option(False, "Take the true columns of a simulated log, to test the method.")
     no_pwm: bool = option(False, "Logs without commands are swings with the hoses off.")

@@ -56,7 +56,7 @@ _OTHERS = frozenset(
     (
         *PICTURES, ".csv", ".tsv", ".parquet", ".mcap", ".bag", ".db3", ".bin", ".log", ".pdf", ".html",
         ".htm", ".json", ".yaml", ".yml", ".xml", ".c", ".h", ".cpp", ".hpp", ".ino", ".py", ".ipynb", ".md",
-        ".mp4", ".avi", ".mkv", ".mov", ".npz", ".npy", ".zip", ".gz",
+        ".mp4", ".avi", ".mkv", ".mov", ".npz", ".npy", ".zip", ".gz", ".svg", ".gif", ".ps", ".eps",
     )
 )  # fmt: skip
 """Endings that promise some kind of file; under any other a file may be of each kind."""

@@ -63,6 +63,7 @@ REFUSED = {
     "simulate swing --duration 1s -o rig.yaml": "rig.yaml: ",
     "simulate swing --duration 1s -o table.csv": "table.csv: is there, and is not a simulated log that",
     "board -o images/view01.png": "view01.png: ends in .png, expected .pdf for a board to print",
+    "board -o board.svg": "board.svg: ends in .svg, expected .pdf for a board to print",
     "board -o photo.pdf": "photo.pdf: is there, and is not a board to print that calib wrote",
     "report rig.yaml -o rig.yaml": "rig.yaml: is an input of this command",
     "report rig.yaml -o table.csv": "table.csv: ends in .csv",

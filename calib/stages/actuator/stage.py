@@ -206,10 +206,12 @@ def _cell(value: float | None, form: str = ".3g") -> str:
 class PumpOptions:
     """Which column is what, and which tables are kept out of the fit."""
 
-    held: tuple[Path, ...] | None = option(None, "Table to predict and not to fit; may be repeated.")
-    time: str | None = option(None, "Column of the time, else recognised.")
-    pwm: str | None = option(None, "Column of the PWM, else recognised.")
-    value: str | None = option(None, "Column of pressure or force, else recognised.")
+    held: tuple[Path, ...] | None = option(
+        None, "Table to predict and not to fit; may be repeated.", metavar="TABLE"
+    )
+    time: str | None = option(None, "Column of the time, else recognised.", metavar="COLUMN")
+    pwm: str | None = option(None, "Column of the PWM, else recognised.", metavar="COLUMN")
+    value: str | None = option(None, "Column of pressure or force, else recognised.", metavar="COLUMN")
     unit: Literal["kPa", "N"] | None = option(None, "Unit of that column.")
 
 

@@ -194,6 +194,7 @@ intrinsics = Stage(
     sources="A folder of pictures (its sub-folders are not read), single pictures, a video, or a bag with an "
     "image topic; or a table of correspondences view,x_m,y_m,u_px,v_px (.csv); or corners of mrgingham or "
     "mrcal (.vnl).",
+    metavar="PICTURES...",
     writes=("camera",),
     document=_camera_document,
     words=_camera_words,

@@ -39,12 +39,19 @@ _REFERENCE = (
     "elongation, step, jump, ellipse, a CSV with t_s and q1_m, q2_m, or x_m, y_m, or phi_rad, "
     "or a recorded log."
 )
-_limits = partial(option, None, "PWM values between which commands stay, as 0,255.", parse=parse_pwm_limits)
+_limits = partial(
+    option,
+    None,
+    "PWM values between which commands stay. [default: the section controller's, else 0,255]",
+    metavar="LOW,HIGH",
+    parse=parse_pwm_limits,
+)
 _duration = partial(
     option,
     None,
-    "Length of a reference by name, such as 30s.",
+    "Length of a reference by name, such as 30s. [default: the reference's own]",
     flag="duration",
+    metavar="TIME",
     parse=parse_duration_s,
 )
 
@@ -86,6 +93,7 @@ class RunOptions:
         "p, pid, clamping, back, pd, pd+ff, pd+map, torque (not in the firmware), tuned-pid, tuned-pd; may "
         "be repeated. [default: all that suit the reference]",
         flag="controller",
+        metavar="NAME",
     )
     feedback: Literal["sensors", "truth"] = option(
         "sensors", "What controllers get: sensors, simulated with their noise, or truth."
@@ -405,6 +413,7 @@ class TuneOptions:
         math.pi / 3.0,
         "Least phase margin, such as 60deg. [default: 60deg]",
         flag="phase-margin",
+        metavar="ANGLE",
         parse=parse_angle_rad,
     )
     sensitivity: float = option(2.0, "Greatest peak of the sensitivity.")
