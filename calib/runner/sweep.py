@@ -28,6 +28,7 @@ from calib.core.result import Number, Pair, Section
 from calib.core.rig import SCHEMA, Rig
 from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
+from calib.core.words import short
 from calib.core.workers import Processes, Task
 from calib.runner import outcomes
 from calib.runner.cache import program
@@ -456,7 +457,7 @@ class SweepSummary:
 
     Attributes
     ----------
-    cases, failed, as_before : how many. why : the first failure's sentence.
+    cases, failed, as_before : how many. why : the first failure, its point and its sentence.
     measure : that decides. measures : all of them.
     best, worst : points, by the median over the draws of the measure, or of its distance from `near`.
     clouds : of each parameter with numbers up to 400 pairs of its value and the measure.
@@ -532,7 +533,9 @@ def summarise_sweep(store: outcomes.Store, spec: Sweep, as_before: int) -> Sweep
     """
     table, measures = _table(store, spec)
     outcomes.write_table(store.out / "sweep.parquet", table)
-    failed = [sentence for sentence in outcomes.texts(table, "sentence") if sentence]
+    sentences = outcomes.texts(table, "sentence")
+    failures = ((case, why) for case, why in zip(cases(spec), sentences, strict=True) if why)
+    why = next((f"{_named(case)}: {sentence}" for case, sentence in failures), "")
     deciding = measures[0] if measures else ""
     y = outcomes.column(table, deciding)
     points = _points(table, spec, y, measures)
@@ -540,9 +543,16 @@ def summarise_sweep(store: outcomes.Store, spec: Sweep, as_before: int) -> Sweep
     clouds = tuple(
         (name, _cloud(outcomes.column(table, name), y)) for name in spec.names if _numeric(spec, name)
     )
-    why = failed[0] if failed else ""
     best, worst = tuple(ranked[:_MOST_SHOWN]), tuple(reversed(ranked[_MOST_SHOWN:][-_MOST_SHOWN:]))
-    return SweepSummary(spec.cases, len(failed), as_before, why, deciding, measures, best, worst, clouds)
+    return SweepSummary(
+        spec.cases, sum(map(bool, sentences)), as_before, why, deciding, measures, best, worst, clouds
+    )
+
+
+def _named(case: Case) -> str:
+    """A case by its point and its parameters."""
+    values = (f"{name} {short(value) if isinstance(value, float) else value}" for name, value in case.values)
+    return f"#{case.point} ({', '.join(values)})"
 
 
 def _points(table: Any, spec: Sweep, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:

@@ -198,9 +198,10 @@ def _row(one: ConstantSummary) -> Sequence[tuple[str, float | None]]:
         return (text or f"{value:.3g}", value) if math.isfinite(value) else ("", None)
 
     return [
-        cell(spread.median, number(spread.median, spread.scale or None)),
-        cell(spread.scale),
-        cell(spread.between),
+        cell(spread.median, number(spread.median, spread.scale or spread.own)),
+        # One value has no spread.
+        cell(spread.scale if spread.count > 1 else math.nan),
+        cell(spread.between if spread.count > 1 else math.nan),
         cell(spread.own),
         cell(float(spread.count), str(spread.count)),
         cell(float(one.standing_out), str(one.standing_out)),
