@@ -257,8 +257,8 @@ def _tell_sweep(summary: SweepSummary) -> None:
     parts = [counted(summary.cases, "case")]
     if summary.as_before:
         parts.append(f"{summary.as_before} as before")
-    if summary.failed:
-        parts.append(f"{summary.failed} failed, the first: {summary.why}")
+    if summary.first:
+        parts.append(f"{summary.failed} failed, the first: {summary.first.told()}: {summary.why}")
     say("; ".join(parts))
     if not summary.best and summary.cases > summary.failed:
         say(f"no case has a value of {summary.measure}")

@@ -10,7 +10,7 @@ import re
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -218,6 +218,13 @@ class Case:
     point: int
     draw: int
     values: tuple[tuple[str, Any], ...]
+
+    def told(self, label: Callable[[str], str] = str) -> str:
+        """Its point and its parameters under their labels, for a sentence."""
+        values = (
+            f"{label(name)} {short(one) if isinstance(one, float) else one}" for name, one in self.values
+        )
+        return f"#{self.point} ({', '.join(values)})"
 
     @property
     def name(self) -> str:
@@ -457,7 +464,7 @@ class SweepSummary:
 
     Attributes
     ----------
-    cases, failed, as_before : how many. why : the first failure, its point and its sentence.
+    cases, failed, as_before : how many. first, why : the case that failed first, and its sentence.
     measure : that decides. measures : all of them.
     best, worst : points, by the median over the draws of the measure, or of its distance from `near`.
     clouds : of each parameter with numbers up to 400 pairs of its value and the measure.
@@ -466,6 +473,7 @@ class SweepSummary:
     cases: int
     failed: int
     as_before: int
+    first: Case | None
     why: str
     measure: str
     measures: tuple[str, ...]
@@ -535,7 +543,7 @@ def summarise_sweep(store: outcomes.Store, spec: Sweep, as_before: int) -> Sweep
     outcomes.write_table(store.out / "sweep.parquet", table)
     sentences = outcomes.texts(table, "sentence")
     failures = ((case, why) for case, why in zip(cases(spec), sentences, strict=True) if why)
-    why = next((f"{_named(case)}: {sentence}" for case, sentence in failures), "")
+    first, why = next(failures, (None, ""))
     deciding = measures[0] if measures else ""
     y = outcomes.column(table, deciding)
     points = _points(table, spec, y, measures)
@@ -545,14 +553,8 @@ def summarise_sweep(store: outcomes.Store, spec: Sweep, as_before: int) -> Sweep
     )
     best, worst = tuple(ranked[:_MOST_SHOWN]), tuple(reversed(ranked[_MOST_SHOWN:][-_MOST_SHOWN:]))
     return SweepSummary(
-        spec.cases, sum(map(bool, sentences)), as_before, why, deciding, measures, best, worst, clouds
+        spec.cases, sum(map(bool, sentences)), as_before, first, why, deciding, measures, best, worst, clouds
     )
-
-
-def _named(case: Case) -> str:
-    """A case by its point and its parameters."""
-    values = (f"{name} {short(value) if isinstance(value, float) else value}" for name, value in case.values)
-    return f"#{case.point} ({', '.join(values)})"
 
 
 def _points(table: Any, spec: Sweep, y: FloatArray, measures: tuple[str, ...]) -> list[Point]:

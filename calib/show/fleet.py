@@ -241,6 +241,7 @@ def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
         version=__version__,
         summary=summary,
         what=what,
+        first=summary.first.told(_headed) if summary.first else "",
         measure=as_words(summary.measure),
         feedback=base.feedback,
         aim="the least is best" if spec.near is None else f"the nearest to {spec.near:g} is best",
