@@ -107,6 +107,18 @@ def test_where_the_filter_begins_again_the_smoother_does() -> None:
     assert np.abs(off[rows.t_s > 2.0]).max() < 2e-4
 
 
+def test_pumps_that_fill_at_once_do_not_lose_the_head() -> None:
+    rig = varied(2)
+    rig = replace(rig, pump=replace(rig.pump, lag_s=0.1))
+    log = log_of(run_scenario(make_scenario("steps"), rig, 2, "sensors", 18.0))
+    setup, rows = setup_for(rig, 2), rows_from(log)
+    setup = replace(setup, process=setup.process.beside(hand=False))
+    filtered = Filter(setup).run(rows)
+    off = smoother.smooth(setup, rows, filtered)[:, 1:3] - truth(log)[:, :2]
+    assert not (filtered[:, OUT.index("flags")].astype(int) & FLAGS["restarted"]).any()
+    assert np.abs(off).max() < 1e-3
+
+
 def cut(log: Log, pieces: int) -> Iterator[Log]:
     for part in np.array_split(np.arange(len(log)), pieces):
         yield replace(log, t_s=log.t_s[part], columns={k: v[part] for k, v in log.columns.items()})

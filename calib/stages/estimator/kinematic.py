@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +64,11 @@ PUSH = EstimatorLevel("push", 2.0, 0.1, 0.4, 50.0, 5e-6, 1e-5)
 With the angle of rest, a longer memory or a smaller acceleration it would take heads at rest as well, whose
 length then jitters by 0.2 mm.
 """
+JUMP = EstimatorLevel("jump", 120.0, 8.0, 0.03, 50.0, 7e-4, 6e-5)
+"""Pumps that fill within three tenths of a second, and throw the head at up to the acceleration of gravity.
+
+No other level expects that: for half a second all accelerations and pictures would be rejected.
+"""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,11 @@ class Kinematic:
     levels: tuple[EstimatorLevel, ...] = LEVELS
     switch_hz: float = 0.1
     sensor_walk: tuple[float, ...] = tuple(one.walk for one in QUANTITIES.values())
+
+    def beside(self, hand: bool) -> Kinematic:
+        """With what tuning does not see: jumps, and where no model says what moves the head a `hand`."""
+        *levels, swing = self.levels
+        return replace(self, levels=(*levels, *([PUSH] if hand else []), JUMP, swing))
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """Levels (M, 8) and squared walks (14,) for the compiled functions."""

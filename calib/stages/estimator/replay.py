@@ -48,7 +48,7 @@ from calib.stages.estimator.driven import (
     smooth_driven,
 )
 from calib.stages.estimator.event import NOISE
-from calib.stages.estimator.kinematic import FLAGS, OUT, PUSH, Filter, Rows, Setup, Start, starting_state
+from calib.stages.estimator.kinematic import FLAGS, OUT, Filter, Rows, Setup, Start, starting_state
 from calib.stages.estimator.noise import jitter_px, with_jitter
 from calib.stages.estimator.read import (
     READINGS,
@@ -861,10 +861,7 @@ def replay_log(
     if not fused and (not log.both or log.periods.pose):
         raise BadInputError(f"{shown(path)}: the baseline needs camera and IMU, and the log lacks one")
     drive = drive_for(log, rig, model)
-    if drive is None:
-        *levels, swing = log.setup.process.levels
-        process = replace(log.setup.process, levels=(*levels, PUSH, swing))
-        log = replace(log, setup=replace(log.setup, process=process))
+    log = replace(log, setup=replace(log.setup, process=log.setup.process.beside(hand=drive is None)))
     radius_m = log.setup.bellows_radius_m
     watch = Watch(seen_by(log.first))
     sums = Sums(Tally(radius_m), Tally(radius_m), watch, trace=Trace() if figures else None)
