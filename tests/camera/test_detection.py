@@ -403,6 +403,25 @@ def test_boards_whose_white_is_clipped_are_found() -> None:
         assert np.sqrt(np.mean(_error(detect(clipped, 9, 6), truth) ** 2)) < 0.05
 
 
+def test_a_board_whose_screen_shows_its_pixels_is_found() -> None:
+    """Dark lines between its pixels, 16 of them along a square's side."""
+    tones = np.pad(np.where(np.indices((6, 9)).sum(axis=0) % 2, 220.0, 30.0), 1, constant_values=220.0)
+    screen = np.kron(tones, np.ones((64, 64)))
+    y, x = np.indices(screen.shape)
+    screen[(y % 4 == 0) | (x % 4 == 0)] *= 0.3
+    corners = np.array([[0, 0], [704, 0], [704, 512], [0, 512]], dtype=np.float32)
+    shown = np.array([[80, 60], [960, 110], [900, 700], [140, 640]], dtype=np.float32)
+    H = cv2.getPerspectiveTransform(corners, shown)
+    picture = cv2.warpPerspective(screen, H, (1040, 760), flags=cv2.INTER_AREA, borderValue=90)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.6)
+    found = detect(np.clip(picture, 0, 255).astype(np.uint8), 8, 5)
+    assert found is not None
+    i, j = np.meshgrid(np.arange(2, 10) * 64 - 0.5, np.arange(2, 7) * 64 - 0.5)
+    truth = cv2.perspectiveTransform(np.stack([i, j], axis=-1).reshape(-1, 1, 2), H.astype(np.float64))
+    apart = np.linalg.norm(found.pixels[:, None] - truth.reshape(1, -1, 2), axis=-1).min(axis=1)
+    assert apart.max() < 0.6
+
+
 def test_the_same_on_any_number_of_threads() -> None:
     grays = [_picture(PIXY, Board(7, 5, 0.02), seed)[0] for seed in range(4)]
     alone = [detect(gray, 7, 5) for gray in grays]

@@ -123,6 +123,8 @@ _INWARD = (0.5, 0.65, 0.8, 1.0)
 
 _SMOOTHED_PX = 12.0
 """Side of squares from which on their tones are averages over 3 x 3 pixels."""
+_FINE = 1 / 14
+"""Share of a square's side below which detail counts for nothing: cells of markers are larger."""
 
 
 def _turns_alike(points: FloatArray) -> bool:
@@ -141,11 +143,15 @@ def _squares_are_plain(grid: Refined, close: bool) -> bool:
     p = grid.part.from_picture(grid.points)
     corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, :-1], p[1:, 1:]])
     middle = corners.mean(axis=0)
-    beside = [-1, 0, 1] if square_px(p) > _SMOOTHED_PX else [0]
+    side = square_px(p)
+    beside = [-1, 0, 1] if side > _SMOOTHED_PX else [0]
+    # The pixels of a screen that shows the board are no marker.
+    fine = max(1, int(_FINE * side))
+    image = np.asarray(cv2.blur(grid.part.image, (fine, fine)), dtype=np.float32)
     around = np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 1, 1, 1, 2)
     # From the quarters, where a marker of half the square's side begins, to the middle.
     inward = np.array(_INWARD)[:, None, None, None, None, None]
-    tones = sample(grid.part.image, corners + inward * (middle - corners) + around).mean(axis=1)
+    tones = sample(image, corners + inward * (middle - corners) + around).mean(axis=1)
     tone = tones[0].mean(axis=0)
     bright = grid.sign * checkered(*tone.shape) > 0
     step = 2.0 * float(np.median(np.abs(grid.amplitude)))
@@ -161,7 +167,7 @@ def _squares_are_plain(grid: Refined, close: bool) -> bool:
             return False
         # Blur makes a bright square brighter all the way to its middle, and a dark one darker. Sharpening
         # turns that about in both, a marker in bright ones.
-        rim = sample(grid.part.image, corners + _RIM * (middle - corners) + around).mean(axis=(0, 1))
+        rim = sample(image, corners + _RIM * (middle - corners) + around).mean(axis=(0, 1))
         profile = tones.mean(axis=1)
         sag = float(np.median((rim - profile.min(axis=0))[bright]))
         rise = float(np.median((profile.max(axis=0) - rim)[~bright]))
