@@ -395,6 +395,18 @@ def test_a_few_wild_readings_of_the_imu_do_little() -> None:
     assert np.all(found.noise.imu < 2.0 * np.array([0.016, 0.016, 0.0025]))
 
 
+@pytest.mark.slow
+def test_wild_readings_among_stamps_of_uneven_bursts_are_left() -> None:
+    trial, rng = known(SimulatedRig()), np.random.default_rng(0)
+    log = align_log(twin_log(trial.rig, *MOTIONS[0], 30, 3.0))
+    ends = np.unique(np.append(rng.integers(0, len(log.imu_s), len(log.imu_s) // 15), len(log.imu_s) - 1))
+    stamps = log.imu_s[ends[np.searchsorted(ends, np.arange(len(log.imu_s)))]]
+    readings = log.readings.copy()
+    readings[::50, 0] = 100.0
+    found = align([replace(log, imu_s=stamps, readings=readings)], prior_settings(trial.view))
+    assert np.isfinite(scores(trial, found)).all()
+
+
 def test_the_jerk_of_a_pump_is_no_scale() -> None:
     """Two readings a knot span do not resolve it: with a fine camera the offset d was 5 sigma off."""
     nominal = SimulatedRig()

@@ -187,7 +187,10 @@ class Stretch:
     @cached_property
     def steep(self) -> FloatArray:
         """Change (m, 3) of the readings in a second, 0 where one is missing."""
-        return np.nan_to_num(np.abs(np.gradient(self.readings, self.imu_s, axis=0)))
+        # Samples of a burst may bear one time: its slope is that of the bursts' means.
+        t, of, count = np.unique(self.imu_s, return_inverse=True, return_counts=True)
+        means = np.add.reduceat(self.readings, np.cumsum(count) - count) / count[:, None]
+        return np.nan_to_num(np.abs(np.gradient(means, t, axis=0)))[of]
 
 
 @dataclass(frozen=True)
@@ -995,7 +998,9 @@ def _followed(stretch: Stretch, c: FloatArray, fit: Fit) -> Stretch:
     off[off <= _UNFOLLOWED * fit.noise.of(stretch, slice(None))] = 0.0
     if not off.any():
         return stretch
-    near = math.ceil(stretch.knots.span_s / float(np.median(np.diff(stretch.imu_s))) - 1e-6)
+    # Of samples that come in bursts most have the time of the one before.
+    step_s = float(stretch.imu_s[-1] - stretch.imu_s[0]) / (len(stretch.imu_s) - 1)
+    near = math.ceil(stretch.knots.span_s / step_s - 1e-6)
     return replace(stretch, start=c, missed=maximum_filter1d(off, 2 * near + 1, axis=0))
 
 
