@@ -414,6 +414,17 @@ def test_what_is_stated_is_held_against_the_logs(name: str, share: float) -> Non
     assert abs(value - truth) < max(5.0 * sigma, 0.2 * abs(share - 1.0) * truth)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.9])
+def test_what_is_known_with_a_deviation_is_held_against_the_fit(share: float) -> None:
+    nominal = replace(Machine(), plant=replace(Machine().plant, rest_length_m=share * 0.065))
+    names = ("rest_length_m", "damping_scale_pumps_connected", "lag_s", "strength2")
+    problem = Problem(nominal, [track("prbs")], names, {}, stated={"rest_length_m": 3e-4})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(nominal)))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    said = [one.text for one in judge(found, uncertainty(found), colour_of(found), [], []).findings]
+    assert any("length at rest is 0.0585 +- 0.0003 m beforehand" in text for text in said) == (share != 1.0)
+
+
 @pytest.mark.parametrize(("full", "unit"), [(255.0, ""), (100.0, "unit: percent"), (1.0, "factor: 255")])
 def test_commands_in_other_units_are_named(full: float, unit: str) -> None:
     tracks = [replace(one, pwm=one.pwm * full / 255.0) for one in (track("prbs"), track("chirp", seed=2))]

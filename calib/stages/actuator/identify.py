@@ -2051,6 +2051,21 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
             )
             advice = "measure it and the mass again, or state its standard deviation under known"
             out.append(Finding("inconsistent", text, advice))
+    # Logs move what is known beforehand by its deviation or two; a fit that ended beside the rig, or a wrong
+    # number, by ten.
+    unknowns = solution.problem.unknowns
+    for name, value, mean, sigma in zip(
+        solution.problem.names, solution.x, unknowns.mean, unknowns.sigma, strict=False
+    ):
+        if abs(value - mean) > _APART_SIGMA * sigma:
+            unit = f" {PARAMETERS[name].unit}".rstrip()
+            before, after = f"{mean:.4g} +- {sigma:.2g}{unit}", f"{value:.4g}{unit}"
+            text = (
+                f"{label_of(name)} is {before} beforehand, and {after} by the fit: another rig's number, or "
+                "a fit that ended beside the rig"
+            )
+            advice = "measure it and the mass again; where they are right, identify with some logs left out"
+            out.append(Finding("inconsistent", text, advice))
     moved, slow = moved_camera(solution), _slowly_commanded(solution.problem)
     if (
         moved is not None
