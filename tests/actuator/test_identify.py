@@ -952,3 +952,16 @@ def test_one_wrong_picture_does_not_decide() -> None:
     assert wrong.replaced == clean.replaced + 1
     assert wrong.errors[ORIGINAL]["q1"].norm == pytest.approx(clean.errors[ORIGINAL]["q1"].norm, rel=0.02)
     assert wrong.improvement_percent("q1") is None
+
+
+@pytest.mark.parametrize("hertz", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize("held_s", [0.0, 0.12, 0.2, 0.4])
+def test_a_head_that_is_held_for_a_moment_is_seen_to_be_let_go(hertz: float, held_s: float) -> None:
+    t = np.arange(0.0, 4.0, 0.01)
+    swung_s = np.maximum(t - held_s - 0.005, 0.0) if held_s else t
+    rate = np.exp(-0.3 * swung_s) * np.sin(2.0 * np.pi * hertz * swung_s)
+    k = let_go(t, 3.0 * rate + np.random.default_rng(1).normal(0.0, 0.003, len(t)), 0.003)
+    if held_s:
+        assert k is not None and held_s < t[k] < held_s + 0.02 + 0.04 / hertz
+    else:
+        assert k is None

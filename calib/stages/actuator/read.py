@@ -291,6 +291,7 @@ _IDENTIFYING_SHORTEST_S = 1.0
 _IDENTIFYING_FEWEST = 40
 _GAP_S = 0.5
 _HELD_S, _HELD_FEWEST = 0.25, 20
+_BRIEFLY_HELD_S, _FEW = 0.1, 5
 _OF_SWING = 0.1
 _BEFORE_RELEASE_S = 0.03
 _MOST_TICKS = 10_000_000
@@ -438,7 +439,7 @@ def _commands(log: Log, no_pwm: bool, said: list[str]) -> tuple[float, float, Fl
     return float(t[0]), tick_s, pwm[latest]
 
 
-def let_go(t_s: FloatArray, away: FloatArray, noise: float) -> int | None:
+def let_go(t_s: FloatArray, away: FloatArray, noise: float | None) -> int | None:
     """Reading at which a head that is held for a while is first seen to swing; None where it swings at once.
 
     This reading and the next are away from the held ones, by more than noise and by a share of what the
@@ -447,13 +448,22 @@ def let_go(t_s: FloatArray, away: FloatArray, noise: float) -> int | None:
     Parameters
     ----------
     t_s, away : (n,) times [s], and angle or rate of the head.
-    noise : standard deviation of a reading.
+    noise : standard deviation of a reading; None where the held ones tell it.
     """
-    held = t_s <= t_s[0] + _HELD_S
-    apart = np.abs(away - np.median(away[held]))
-    both = np.minimum(apart[:-1], apart[1:])
-    swings = np.nonzero(both > max(_SURE * noise, _OF_SWING * both.max(initial=0.0)))[0]
-    return int(swings[0]) if len(swings) and not held[swings[0]] else None
+    for held_s in (_HELD_S, _BRIEFLY_HELD_S):
+        held = t_s <= t_s[0] + held_s
+        off = away - np.median(away[held])
+        first, apart = off[held], np.abs(off)
+        both = np.minimum(apart[:-1], apart[1:])
+        least = _OF_SWING * both.max(initial=0.0)
+        sure = _SURE * (robust_sigma(first) if noise is None else noise)
+        # A head that swings at once moves in so short a time, too: it has to be still beside its swing.
+        if held_s < _HELD_S and (len(first) < _FEW or max(sure, np.abs(first).max()) > least):
+            return None
+        swings = np.nonzero(both > max(sure, least))[0]
+        if len(swings) and not held[swings[0]]:
+            return int(swings[0])
+    return None
 
 
 def release_s(log: Log, t_s: FloatArray, phi: FloatArray, noise_rad: float) -> float | None:
@@ -469,11 +479,11 @@ def release_s(log: Log, t_s: FloatArray, phi: FloatArray, noise_rad: float) -> f
         k = let_go(t_s, phi, noise_rad)
         return None if k is None else float(t_s[k]) - _BEFORE_RELEASE_S
     gyro = log.signals("gz_radps")
-    first = gyro.values[gyro.t_s <= gyro.t_s[0] + _HELD_S, 0]
-    rate = gyro.values[:, 0] - np.median(first)
-    k = let_go(gyro.t_s, rate, robust_sigma(first - np.median(first)))
+    rate = gyro.values[:, 0]
+    k = let_go(gyro.t_s, rate, None)
     if k is None:
         return None
+    rate = rate - np.median(rate[: min(k, int(np.searchsorted(gyro.t_s, gyro.t_s[0] + _HELD_S, "right")))])
     rise = (rate[k + 1] - rate[k]) / (gyro.t_s[k + 1] - gyro.t_s[k])
     since = rate[k] / rise if rise * rate[k] > 0.0 else 0.0
     return float(gyro.t_s[k] - min(since, gyro.t_s[k] - gyro.t_s[k - 1]))
