@@ -80,12 +80,14 @@ def test_an_identification_beats_black_boxes_and_says_by_how_much(trials: list[T
     assert all(0.0 < share <= 1.0 + 1e-9 for one in left.values() for share in one.values())
 
 
-def test_a_part_that_is_off_plays_no_part() -> None:
+@pytest.mark.parametrize("toe_kpa", [0.0, 60.0])
+def test_a_segment_alone_lags_behind_what_its_pressure_bends(toe_kpa: float) -> None:
     one = simulated("a", 1)
     off = FULL.without("creep", "hysteresis", "settling", "load").values(np.zeros(len(PARAMETERS)), SCALE)
     p = np.full(len(one.t_s), 100.0)
-    angle, _ = segment_run(one, off, p)
-    rest = off["rest_rad"] + 100.0 * off["bends_rad_per_kpa"] / (1.0 + 100.0 * off["stiffens_per_kpa"])
+    angle, _ = segment_run(one, off | {"toe_kpa": toe_kpa}, p)
+    drives = 100.0**2 / (100.0 + toe_kpa)
+    rest = off["rest_rad"] + drives * off["bends_rad_per_kpa"] / (1.0 + 100.0 * off["stiffens_per_kpa"])
     expected = rest + (one.begins[1] - rest) * np.exp(-one.t_s / off["lag_s"])
     np.testing.assert_allclose(angle, expected, atol=1e-9)
 
@@ -459,6 +461,17 @@ def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:
     assert found.fit.values["bends_rad_per_kpa"] == pytest.approx(0.004, rel=0.03)
     assert found.fit.values["lag_s"] == pytest.approx(1.0, rel=0.05)
     assert found.fit.values["stiffens_per_kpa"] < 2e-4
+
+
+@pytest.mark.slow
+def test_an_arm_that_first_takes_up_slack_has_a_toe() -> None:
+    plain = FULL.without("load")
+    values = plain.values(np.zeros(len(PARAMETERS)), SCALE)
+    trials = [simulated(f"a_{k}", k, values=values | {"toe_kpa": 200.0}) for k in range(3)]
+    found = identify(trials, compare=False)
+    assert "toe" in found.fit.assembly.parts
+    without = mean_of(found.others["without toe"], "angle_by_pressure_rad")
+    assert mean_of(found.held, "angle_by_pressure_rad") < 0.8 * without
 
 
 @pytest.mark.slow

@@ -45,7 +45,9 @@ from calib.stages.arm.model import (
     values_on,
 )
 
-FULL = Assembly(tuple(part.name for part in PARTS if part.name not in ("lag", "pump", "inertia")))
+_TRIED = ("toe", "inertia")
+"""Parts that are taken where they predict held trials better."""
+FULL = Assembly(tuple(part.name for part in PARTS if part.name not in ("lag", "pump", *_TRIED)))
 WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
 _SIGMA = {"pressure_kpa": 0.03, "angle_rad": 0.027, "chord_m": 0.0045}
@@ -529,11 +531,11 @@ def identify(
             assembly, held, errors = driven, fits, by_other
         else:
             others[f"a {other_drive} for the {drive}"] = by_other
-    if held and any(len(one.angle_rad) for one in trials):
-        swings = Assembly((*assembly.parts, "inertia"))
-        if _error(trials, held_fits(trials, swings, scale)) <= _WORTHWHILE * _error(trials, held):
-            others["without inertia"] = errors
-            assembly = swings
+    for name in _TRIED if held and any(len(one.angle_rad) for one in trials) else ():
+        more = Assembly((*assembly.parts, name))
+        if _error(trials, held_fits(trials, more, scale)) <= _WORTHWHILE * _error(trials, held):
+            others[f"without {name}"] = errors
+            assembly = more
             scale, held = _held(trials, assembly, replace(scale, finer=1.0))
             errors = {one.name: errors_of(held[one.name], one) for one in trials}
     variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}

@@ -24,13 +24,15 @@ empties through an orifice and seeps:
 
 Segment: the chamber of the arm fills, p_f, with the fill time. The angle phi [rad] follows its rest value
 with one viscous lag; of an arm that swings the inertia T plays a part and a share z of the lag is left, of
-others T = 0 and z = 1. Pressure stiffens, so that the moments of pressure, load and hysteresis bend less
+others T = 0 and z = 1. A chamber that first takes up slack bends little up to about the pressure p_t of the
+toe, 0 of others. Pressure stiffens, so that the moments of pressure, load and hysteresis bend less
 under it. w is a stop, the elastic part of the angle's changes, of at most the hysteresis' range; c creeps
 after the angle; s is by how much the chord is too short at the start, as of an arm that was vented, and s' is
 that of the chord, which recovers in a time of its own:
 
     dp_f/dt = (p - p_f) / t_f
-    T^2 d2phi/dt2 + z tau dphi/dt = phi_0 + (a p_f + m g l W(phi) - h w / r) / (1 + b p_f) + q c + v s - phi
+    T^2 d2phi/dt2 + z tau dphi/dt = phi_0 + M / (1 + b p_f) + q c + v s - phi
+    M = a p_f |p_f| / (|p_f| + p_t) + m g l W(phi) - h w / r
     dw = dphi,  |w| <= r;   dc/dt = (phi - phi_0 - c) / tau_c;   ds/dt = -s exp(e p_f) / tau_s,  s' as s
 
 W = C sin(.55 phi) + D cos(.55 phi) is by how much the moment m g l of a load at the tip of an arm of length l
@@ -204,6 +206,11 @@ PARTS = (
             Parameter("damps", "", 0.1, 1.0, True, identified_by=_STEPS),
         ),
         {"swings_s": 0.0, "damps": 1.0},
+    ),
+    Part(
+        "toe",
+        (Parameter("toe_kpa", "kPa", 0.2, 1.0, True, _P, identified_by=_SLOW),),
+        {"toe_kpa": 0.0},
     ),
     Part(
         "stiffening",
@@ -418,6 +425,7 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         lag,
         swings,
         damps,
+        toe,
         stiffens,
         stop,
         reach,
@@ -426,8 +434,8 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         vented,
         settling_s,
         sooner,
-    ) = q[:14]
-    compliance, across, c0, c1, c2, lengthens_s, longer = q[14:]
+    ) = q[:15]
+    compliance, across, c0, c1, c2, lengthens_s, longer = q[15:]
     out = np.empty((len(pressure), 2))
     short = lacks = c0 + c1 * angle + c2 * angle * angle - chord
     elastic, crept = 0.0, 0.0
@@ -439,7 +447,10 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         out[k, 1] = c0 + c1 * angle + c2 * angle * angle - lacks
         inside += fills * (pressure[k] - inside)
         weighs = moment * load_bends(angle, compliance, across)
-        bends = linear * inside + weighs - stop * elastic / reach
+        bends = linear * inside
+        if toe > 0.0:
+            bends *= abs(inside) / (abs(inside) + toe)
+        bends += weighs - stop * elastic / reach
         aim = rest + bends / max(1.0 + stiffens * inside, 0.1)
         lacking = aim + creep * crept + vented * short - angle
         change = follows * lacking
