@@ -764,13 +764,7 @@ def covariance(
             np.diag(np.full(P + 6, np.inf)),
             distance,
         )
-    motion = np.zeros((len(H), 6, 6))
-    motion[:, :3, :3] = motion[:, 3:, 3:] = np.eye(3)
-    motion[:, 3:, :3] = -cross_matrices(t)
-    weighted = motion.transpose(0, 2, 1) @ V
-    total = (weighted @ motion).sum(axis=0)
-    # g = sum_i F_i dz_i with F_i = total^-1 G_i' V_i; dz_i = -E_i ds + its own noise.
-    F = np.linalg.solve(total, weighted)
+    F = common_motion(V, t)
     of_shared = -np.einsum("nab,nbg->ag", F, E)
     own = np.einsum("nab,nbc,ndc->ad", F, V_inverse, F)
     shared = variance * S_inverse
@@ -782,6 +776,15 @@ def covariance(
     joint[:P, P:] = joint[P:, :P].T
     joint[P:, P:] = of_shared @ shared @ of_shared.T + variance * own
     return Covariance(calibration.free_names, shared[:P, :P], joint, distance)
+
+
+def common_motion(V: FloatArray, t_CT_m: FloatArray) -> FloatArray:
+    """F (N, 6, 6) of g = sum_i F_i dz_i, from the poses' information (N, 6, 6) and places (N, 3)."""
+    motion = np.zeros_like(V)
+    motion[:, :3, :3] = motion[:, 3:, 3:] = np.eye(3)
+    motion[:, 3:, :3] = -cross_matrices(t_CT_m)
+    weighted = motion.transpose(0, 2, 1) @ V
+    return np.linalg.solve((weighted @ motion).sum(axis=0), weighted)
 
 
 def joint_jacobian(calibration: Calibration, points_C: FloatArray) -> FloatArray:

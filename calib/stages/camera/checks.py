@@ -357,6 +357,17 @@ def eliminated(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, Fl
     return 0.5 * (S + S.transpose(0, 2, 1)), gradient[:, :-6] - solved[..., -1]
 
 
+def _linearised(calibration: bundle.Calibration, basis: FloatArray | None) -> bundle.Linearised:
+    observations = calibration.shaped(calibration.observations)
+    at_rest = replace(calibration.block, deformation=np.zeros(0 if basis is None else basis.shape[-3]))
+    at = bundle.linearise(
+        at_rest, observations, calibration.free, basis, calibration.loss, calibration.scale_px
+    )
+    if at is None:
+        raise ValueError("the calibration has points behind the camera")
+    return at
+
+
 def evidence(
     calibration: bundle.Calibration, basis: FloatArray | None = None, names: tuple[str, ...] = ()
 ) -> Evidence:
@@ -372,13 +383,7 @@ def evidence(
     ------
     ValueError : the calibration has points behind the camera.
     """
-    observations = calibration.shaped(calibration.observations)
-    at_rest = replace(calibration.block, deformation=np.zeros(0 if basis is None else basis.shape[-3]))
-    at = bundle.linearise(
-        at_rest, observations, calibration.free, basis, calibration.loss, calibration.scale_px
-    )
-    if at is None:
-        raise ValueError("the calibration has points behind the camera")
+    at = _linearised(calibration, basis)
     S, b = eliminated(at.normal, at.gradient)
     return Evidence(
         names=calibration.free_names + names,
@@ -386,7 +391,7 @@ def evidence(
         S=S,
         b=b,
         cost=(at.residuals**2).sum(axis=(1, 2)),
-        measured=2 * observations.present.sum(axis=1),
+        measured=2 * calibration.observations.present.sum(axis=1),
         sigma_px=calibration.sigma_px,
     )
 
@@ -671,6 +676,32 @@ def scatter_beyond(found: Evidence, inflation: float) -> list[FloatArray]:
     return [shift for shift in even * (root @ directions * np.sqrt(excess)).T if shift.any()]
 
 
+_PRINTED = 0.002
+"""Standard deviation of a square's height over its width; printers stretch by up to half a percent."""
+
+
+def stretched(calibration: bundle.Calibration, inflation: float) -> FloatArray:
+    """One standard deviation (P + 6,) of what squares stretched by a printer move: intrinsics and poses.
+
+    Boards that are all upright in the picture hardly tell their squares' height from fy. It is estimated from
+    the views and from what printers do; its mean or its deviation, whichever is larger, moves the others.
+    """
+    aspect = _basis(calibration)[0][..., :1, :, :]
+    basis = aspect if calibration.basis is None else np.concatenate([calibration.basis, aspect])
+    at = _linearised(calibration, basis)
+    views, b = eliminated(at.normal, at.gradient)
+    S = views.sum(axis=0)
+    follow = np.append(-scaled_inverse(S[:-1, :-1]) @ S[:-1, -1], 1.0)
+    variance = max((inflation * calibration.sigma_px) ** 2, 1e-300)
+    left = 1.0 / (float(follow @ S @ follow) / variance + _PRINTED**-2)
+    mean = left * float(follow @ b.sum(axis=0)) / variance
+    V, W = at.normal[:, -6:, -6:], at.normal[:, :-6, -6:]
+    poses = -np.linalg.solve(V, (follow @ W)[..., None])
+    motion = (bundle.common_motion(V, calibration.block.t_CT_m) @ poses).sum(axis=0)[:, 0]
+    moved = np.concatenate([follow[: len(calibration.free)], motion])
+    return np.asarray(moved * max(math.sqrt(left), abs(mean)))
+
+
 TELL_SHAPE = 4
 """Views from which on the board's shape is told from the poses."""
 
@@ -687,20 +718,23 @@ def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
         found = evidence(calibration, calibration.basis).of_the_camera()
         inflation = overdispersion(found)
         shifts = scatter_beyond(found, inflation)
-        tells = calibration.basis is None and calibration.observations.views >= TELL_SHAPE
+        enough = calibration.observations.views >= TELL_SHAPE
+        # A board whose every corner is estimated has its aspect, too.
+        few = len(calibration.block.deformation) <= len(DEFORMATIONS)
+        moved = [stretched(calibration, inflation)] if enough and few else []
+        tells = enough and calibration.basis is None
         shape, ran = (shape_or_none(calibration), drift(calibration)) if tells else (None, None)
     except (np.linalg.LinAlgError, ValueError):
-        inflation, shifts, shape, ran = 1.0, [], None, None
+        inflation, shifts, moved, shape, ran = 1.0, [], [], None, None
     variance = (inflation * calibration.sigma_px) ** 2
     if shape is not None and shape.allowed:
         shifts.append(shape.shift)
     known = bundle.covariance(calibration, variance, shifts)
-    if ran is None:
-        return known
-    # What changes is the camera: it may be turned for that, but no pose is nearer than it was.
-    moved = np.concatenate([ran, turn_for(calibration, ran)[0], np.zeros(3)])
-    whole = known.intrinsics + np.outer(ran, ran), known.joint + np.outer(moved, moved)
-    return replace(known, intrinsics=whole[0], joint=whole[1])
+    if ran is not None:
+        # What changes is the camera: it may be turned for that, but no pose is nearer than it was.
+        moved.append(np.concatenate([ran, turn_for(calibration, ran)[0], np.zeros(3)]))
+    joint = known.joint + sum(np.outer(one, one) for one in moved)
+    return replace(known, intrinsics=joint[: len(known.names), : len(known.names)], joint=joint)
 
 
 # ----------------------------------------------------------------------

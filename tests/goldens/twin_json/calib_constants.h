@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x2A757930UL
+#define CALIB_ID 0xA9920A46UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -134,8 +134,8 @@
  * reciprocal depth.
  */
 #define CALIB_PLANE_NORMALISED_11 1.00044465f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241307337f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202328842f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241307355f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202328805f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_21 0.0216922779f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.987372577f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_23 0.220938459f /* row 2, A^-1 K, dimensionless to m */
@@ -178,7 +178,7 @@
 #define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0680584311f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.01740646f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00579439756f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228071399f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.022807112f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -198,7 +198,7 @@
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145611567f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145611577f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -235,10 +235,10 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.50148654f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000253142294f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.87496515e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.20656443e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.77445235e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000253142265f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.87495788e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.20656397e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.77444553e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000257548585f /* row 2, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_2 -1.74415181e-05f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00250804378f /* K_a, share of the accelerometer's residual */

@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xB64CA3D9UL
+#define CALIB_ID 0x49954DE0UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -122,8 +122,8 @@
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
 #define CALIB_PLANE_INVERSE_11 0.00365900039f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.85204572e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.599087417f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.85204645e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599087358f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_21 7.93372674e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_22 0.00362189463f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_23 -0.160745218f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -136,8 +136,8 @@
  * reciprocal depth.
  */
 #define CALIB_PLANE_NORMALISED_11 1.00046384f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241322331f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202176087f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.024132235f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202175602f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_21 0.0216928273f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.987392128f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_23 0.220937505f /* row 2, A^-1 K, dimensionless to m */
@@ -152,10 +152,10 @@
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
 #define CALIB_PLANE_RAW_11 0.00369098713f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82964887e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604354918f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82965032e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604354858f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_21 7.2216666e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.0036320705f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363207026f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_23 -0.160445973f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000437254144f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111405493f /* row 3, distorted px to m */
@@ -167,7 +167,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), for D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.486936092f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.486936063f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -176,11 +176,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0836254656f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0310469605f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0836265162f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0310470499f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.00114584f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00599168986f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0184687059f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0184684433f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -237,12 +237,12 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.51306391f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000257287611f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.75775505e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 2.13680814e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.75230945e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.00025728764f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.75768775e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 2.13683561e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.7522426e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000257582433f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -8.39456516e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_2 -8.39458789e-06f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00252338685f /* K_a, share of the accelerometer's residual */
 #define CALIB_FUSED_ACCEL_WEAK 0.000257225969f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00827223528f /* dt / 2 over the gyroscope's scale, s */
@@ -252,7 +252,7 @@
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.5292244f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00252451072f /* K_b, share of the correction */
 #define CALIB_FUSED_MOVING_LENGTH 0.187839791f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00685633812f /* K_v, per tick */
+#define CALIB_FUSED_MOVING_RATE 0.00685633859f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.00903080683f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
@@ -314,9 +314,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.230835f, 139.722641f, 149.154572f, 157.587555f, 165.497833f,
-    173.136703f, 180.664612f, 188.245316f, 196.046188f, 204.278442f, 213.307434f,
-    223.946777f, 241.122681f, 253.5f,
+    99.75f, 128.230835f, 139.722641f, 149.154572f, 157.58757f, 165.497849f,
+    173.136703f, 180.664627f, 188.245316f, 196.046188f, 204.278442f, 213.307449f,
+    223.946793f, 241.122757f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
