@@ -12,6 +12,7 @@ import pytest
 from armtrials import SCALE, TRUE, columns_of, simulated
 from scipy.spatial.transform import Rotation
 
+import calib.stages.arm.identify as identification
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
@@ -461,6 +462,17 @@ def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:
     assert found.fit.values["bends_rad_per_kpa"] == pytest.approx(0.004, rel=0.03)
     assert found.fit.values["lag_s"] == pytest.approx(1.0, rel=0.05)
     assert found.fit.values["stiffens_per_kpa"] < 2e-4
+
+
+def test_a_trial_that_is_far_off_whatever_the_parts_outweighs_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trials = [SimpleNamespace(name=name) for name in "abcd"]
+    monkeypatch.setattr(
+        identification, "errors_of", lambda e, _: {"angle_by_pressure_rad": e, "angle_rad": e}
+    )
+    plain, more = ({"a": 0.35} | dict.fromkeys("bcd", error) for error in (0.05, 0.02))
+    assert identification._error(trials, more) < 0.8 * identification._error(trials, plain)
 
 
 @pytest.mark.slow

@@ -403,10 +403,16 @@ _WORTHWHILE = 0.8
 
 
 def _error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
-    """Mean error of the held trials' angle by what drives the segment most closely."""
-    errors = {one.name: errors_of(held[one.name], one) for one in trials}
-    means = [mean_of(errors, name) for name in ("angle_by_pressure_rad", "angle_rad")]
-    return next((x for x in means if math.isfinite(x)), math.inf)
+    """Geometric mean error of the held trials' angle by what drives the segment most closely.
+
+    A trial that alone holds its load or day is far off whatever the parts, and outweighs no other.
+    """
+    errors = [errors_of(held[one.name], one) for one in trials]
+    for name in ("angle_by_pressure_rad", "angle_rad"):
+        values = [one[name] for one in errors if math.isfinite(one[name])]
+        if values:
+            return math.exp(sum(math.log(max(x, 1e-9)) for x in values) / len(values))
+    return math.inf
 
 
 def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Scale, dict[str, Fit]]:
