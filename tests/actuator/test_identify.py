@@ -18,8 +18,10 @@ from calib.core.rig import Rig
 from calib.core.stage import Files
 from calib.io.experiments import EXPERIMENTS
 from calib.io.logs import Log, read_log, write_log
+from calib.stages.actuator import identify
 from calib.stages.actuator.identify import (
     PARAMETERS,
+    Moved,
     Problem,
     Solution,
     Start,
@@ -508,6 +510,18 @@ def test_a_camera_that_moves_in_a_log_or_between_logs_is_named(which: int | None
         assert not from_s or moved.name == tracks[which].name
         assert moved.from_s == pytest.approx(from_s, abs=0.2)
         assert abs(moved.length_m) == pytest.approx(1e-3, rel=0.2)
+
+
+@pytest.mark.parametrize(("phi_rad", "length_m", "word"), [(1e-3, 5e-5, "ok"), (0.01, 5e-5, "inconsistent")])
+def test_a_move_that_a_fine_camera_alone_sees_is_none(
+    phi_rad: float, length_m: float, word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = Problem(Machine(), [track("prbs")], ("stiffness_scale", "lag_s"), {})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    moved = Moved("prbs", 1.0, phi_rad, length_m, readings=5.0, deviations=50.0)
+    monkeypatch.setattr(identify, "moved_camera", lambda _: moved)
+    assert judge(found, uncertainty(found), colour_of(found), [], []).word == word
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -184,6 +185,18 @@ def test_a_camera_that_moved_along_the_actuator_is_told(scenario: str) -> None:
         longer_m, sigma_m = estimate.longer_m
         assert bool(list(grown(longer_m, sigma_m))) == (along_px != 0.0), longer_m
         assert along_px * longer_m >= 0.0
+
+
+def test_an_imu_whose_samples_come_in_bursts_is_said_to_be_late_by_more_than_nothing() -> None:
+    """Twelve samples bear the time of the last one."""
+    _, log = driven_log("ellipse")
+    sampled = log.sampled("gz_radps")
+    t = log.t_s.copy()
+    for burst in np.split(sampled, range(12, len(sampled), 12)):
+        t[burst[0] : burst[-1] + 1] = t[burst[-1]]
+    (finding,) = untimely(setup_for(varied_drive(0)), rows_from(replace(log, t_s=t)))
+    (late_ms,) = map(float, re.findall(r"the IMU comes (\d+) ms", finding.text))
+    assert late_ms > 5.0, finding.text
 
 
 def test_a_clock_that_steps_midway_is_named() -> None:

@@ -1998,6 +1998,8 @@ def by_logs(solution: Solution) -> dict[str, tuple[float, float]]:
 _MOMENTS = 20
 _LEAST_READINGS = 0.5
 """Moments of a log at which a camera may have moved; noises of a reading, .2 px, below which it has not."""
+_MOVED_RAD, _MOVED_M = math.radians(0.1), 1e-4
+"""Turn and growth of the head up to which, before a fine camera, its move does no harm."""
 _STATED_OFF = 0.02
 _CROSSED, _BENDS_RAD = -0.5, 0.05
 _UNLIKE = 1.15
@@ -2071,6 +2073,7 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
         moved is not None
         and moved.name not in slow
         and moved.readings > _LEAST_READINGS
+        and (abs(moved.phi_rad) > _MOVED_RAD or abs(moved.length_m) > _MOVED_M)
         and moved.deviations > _APART_SIGMA * raised
     ):
         when, then = f"from about {moved.from_s:.1f} s on", "cut the log there, and"

@@ -811,7 +811,9 @@ def _late(setup: Setup, rows: Rows) -> list[str]:
             while abs(shift) < _LATEST and likelihood(names, shift + step) > likelihood(names, shift):
                 shift += step
             found[names] = max(found.get(names, (-math.inf, 0)), (likelihood(names, shift), shift))
-    period_ms = 1e3 * float(np.median(np.diff(rows.t_s[np.isfinite(rows.readings[:, 2:]).any(axis=1)])))
+    # In bursts most samples bear the time of the one before.
+    stamps = np.unique(rows.t_s[(own := np.isfinite(rows.readings[:, 2:]).any(axis=1))])
+    period_ms = 1e3 * float(np.median(np.diff(stamps))) * len(stamps) / own.sum()
     best = max((value for value, _ in found.values()), default=0.0)
     return [
         _TOGETHER[names].format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
