@@ -9,6 +9,7 @@ from __future__ import annotations
 import html
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -87,12 +88,12 @@ def short(value: float) -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
 
 
-class InWords:
+class InWords(ABC):
     """A value that a person who types its name sees in words, in a notebook as tables."""
 
+    @abstractmethod
     def blocks(self) -> Iterable[Block]:
         """The words."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         return "\n".join(as_text(list(self.blocks())))
@@ -116,7 +117,7 @@ def facts(section: BaseModel) -> list[tuple[str, str]]:
     sigmas = getattr(section, "sigma", None)
     out: list[tuple[str, str]] = []
     for key, field, value in _labelled(section):
-        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+        extra = _extra(field)
         wanted, bars = extra.get("fact"), _named(sigmas, key)
         unit, scale, places = _shown(key, field)
         if isinstance(wanted, list):
@@ -233,9 +234,14 @@ def _labelled(section: BaseModel) -> Iterator[tuple[str, FieldInfo, Any]]:
             yield key, field, value
 
 
+def _extra(field: FieldInfo) -> Mapping[str, Any]:
+    """How a field is shown, as `quantity` was told."""
+    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
 def _shown(key: str, field: FieldInfo) -> tuple[str, float, int | None]:
     """Unit that a field is shown in, what its value is multiplied by for it, digits behind the point."""
-    extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+    extra = _extra(field)
     unit = unit_of(key)
     show = {"deg": "°", "deg/s": "°/s"}.get(str(extra.get("show") or ""), str(extra.get("show") or ""))
     places = extra.get("digits")
@@ -336,11 +342,7 @@ def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:
         for key, field in columns.items():
             value = getattr(one, key)
             _, scale, places = _shown(key, field)
-            by = (
-                field.json_schema_extra.get("digits_by")
-                if isinstance(field.json_schema_extra, dict)
-                else None
-            )
+            by = _extra(field).get("digits_by")
             if by or isinstance(value, list | bool | str):
                 cells.append(_cell(value, scale, places, getattr(one, str(by), None)))
             else:

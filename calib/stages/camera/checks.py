@@ -455,6 +455,12 @@ def overdispersion(found: Evidence) -> float:
     return float(np.sqrt(max(ratio, 1.0)))
 
 
+def _root(found: Evidence) -> FloatArray:
+    """Root L (G, G) of the covariance L L' of the shared parameters, over the variance of a coordinate."""
+    values, vectors = np.linalg.eigh(scaled_inverse(found.S.sum(axis=0)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
 _TOLD = 1e-3
 """What a view tells of a direction, over what all views do, below which it is silent there."""
 
@@ -467,8 +473,7 @@ def alone_px(calibration: bundle.Calibration) -> tuple[float, float]:
     """
     free = np.union1d(calibration.free, [model.INTRINSICS.index("skew_px")])
     found = evidence(replace(calibration, free=free))
-    values, vectors = np.linalg.eigh(scaled_inverse(found.S.sum(axis=0)))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = _root(found)
     told, Q = np.linalg.eigh(root.T @ found.S @ root)
     y2 = np.einsum("ngk,ng->nk", root @ Q, found.b) ** 2
     counts = told > _TOLD
@@ -665,8 +670,7 @@ def scatter_beyond(found: Evidence, inflation: float) -> list[FloatArray]:
     inflation : `overdispersion` of it.
     """
     views, P = found.b.shape
-    values, vectors = np.linalg.eigh(scaled_inverse(found.S.sum(axis=0)))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = _root(found)
     left, Q = np.linalg.eigh(np.eye(P) - root.T @ found.S @ root)
     score = Q.transpose(0, 2, 1) @ (found.b @ root)[..., None] / np.sqrt(np.maximum(left, 1e-9))[..., None]
     even = max(inflation * found.sigma_px, 1e-300)

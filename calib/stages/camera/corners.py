@@ -146,8 +146,9 @@ def _squares_are_plain(grid: Refined, close: bool) -> bool:
     side = square_px(p)
     beside = [-1, 0, 1] if side > _SMOOTHED_PX else [0]
     # The pixels of a screen that shows the board are no marker.
-    fine = max(1, int(_FINE * side))
-    image = np.asarray(cv2.blur(grid.part.image, (fine, fine)), dtype=np.float32)
+    fine, image = int(_FINE * side), grid.part.image
+    if fine > 1:
+        image = np.asarray(cv2.blur(image, (fine, fine)), dtype=np.float32)
     around = np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 1, 1, 1, 2)
     # From the quarters, where a marker of half the square's side begins, to the middle.
     inward = np.array(_INWARD)[:, None, None, None, None, None]
