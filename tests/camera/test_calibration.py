@@ -688,15 +688,16 @@ def test_bow_is_measured(bow_m: float) -> None:
 def test_sigma_allows_for_squares_that_are_hardly_told_from_square_ones(
     aspect: float, roll_deg: float
 ) -> None:
-    """Where boards are hardly turned in their plane they move fy by six to twelve deviations."""
+    """Where boards are hardly turned they move fy by six to twelve deviations, which count once."""
     camera, away = camera_of(), []
     for seed in range(12):
         recipe = Recipe(0.08, aspect=aspect, roll_deg=roll_deg)
         views = take(np.random.default_rng(seed), camera, 15, recipe=recipe)
         fit = calibrate(pack(views), camera.image_size_px, "radial2")
         sigma = by_the_views(fit).sigma()
-        away += [abs(getattr(fit.camera, n) - getattr(camera, n)) / sigma[n] for n in ("fx_px", "fy_px")]
-    assert max(away) < 3.0
+        away.append([abs(getattr(fit.camera, n) - getattr(camera, n)) / sigma[n] for n in ("fx_px", "fy_px")])
+    assert np.max(away) < 3.0
+    assert np.median(np.max(away, axis=1)) > 0.8
 
 
 # ----------------------------------------------------------------------

@@ -514,7 +514,7 @@ class TargetShape:
     bow_m : largest departure from flatness between the target's middle and its border.
     bow_significance : square root of the Wald statistic of the three bows, over its degrees of freedom.
     size_m : longer side of the target.
-    shift : (P,) by how much the intrinsics would move. focal_shift : share by which fx would.
+    focal_shift : share by which fx would move.
     focal_per_bow : share by which fx moves for a bow of half a percent of the target's size.
     values, sigma : (5,) in the order of `DEFORMATIONS`; slopes, and metres for bows and twist.
     displacement_m : (M, 3) or (N, M, 3) of the target's points, all five together.
@@ -525,7 +525,6 @@ class TargetShape:
     bow_m: float
     bow_significance: float
     size_m: float
-    shift: FloatArray
     focal_shift: float
     focal_per_bow: float
     values: FloatArray
@@ -594,7 +593,6 @@ def target_shape(calibration: bundle.Calibration) -> TargetShape | None:
         bow_m=float(np.ptp(np.tensordot(bows, basis[..., 2:, 2, :], axes=(0, basis.ndim - 3)))),
         bow_significance=float(np.sqrt(wald / 3)),
         size_m=2 * half,
-        shift=step[:P],
         focal_shift=float(step[fx_at] / fx),
         focal_per_bow=float(np.abs(row[2:4]).max() * 0.01 * half / fx),
         values=step[P:],
@@ -684,26 +682,36 @@ _PRINTED = 0.002
 """Standard deviation of a square's height over its width; printers stretch by up to half a percent."""
 
 
-def stretched(calibration: bundle.Calibration, inflation: float) -> FloatArray:
-    """One standard deviation (P + 6,) of what squares stretched by a printer move: intrinsics and poses.
+def misprinted(
+    calibration: bundle.Calibration, inflation: float, values: FloatArray | None
+) -> list[FloatArray]:
+    """One standard deviation each, (P + 6,), of what a board not as described moves: intrinsics and poses.
 
     Boards that are all upright in the picture hardly tell their squares' height from fy. It is estimated from
     the views and from what printers do; its mean or its deviation, whichever is larger, moves the others.
+
+    Parameters
+    ----------
+    values : (5,) of `TargetShape` where sigma allows for it; they hold the mean then.
     """
-    aspect = _basis(calibration)[0][..., :1, :, :]
-    basis = aspect if calibration.basis is None else np.concatenate([calibration.basis, aspect])
+    own = _basis(calibration)[0]
+    basis = own if calibration.basis is None else np.concatenate([calibration.basis, own])
     at = _linearised(calibration, basis)
     views, b = eliminated(at.normal, at.gradient)
-    S = views.sum(axis=0)
-    follow = np.append(-scaled_inverse(S[:-1, :-1]) @ S[:-1, -1], 1.0)
+    S, K = views.sum(axis=0), len(DEFORMATIONS)
+    follow = np.concatenate([-scaled_inverse(S[:-K, :-K]) @ S[:-K, -K:], np.eye(K)])
+    aspect = follow[:, 0]
     variance = max((inflation * calibration.sigma_px) ** 2, 1e-300)
-    left = 1.0 / (float(follow @ S @ follow) / variance + _PRINTED**-2)
-    mean = left * float(follow @ b.sum(axis=0)) / variance
+    left = 1.0 / (float(aspect @ S @ aspect) / variance + _PRINTED**-2)
+    mean = left * float(aspect @ b.sum(axis=0)) / variance if values is None else 0.0
+    shared = [aspect * max(math.sqrt(left), abs(mean))]
+    if values is not None:
+        shared.append(follow @ values)
     V, W = at.normal[:, -6:, -6:], at.normal[:, :-6, -6:]
-    poses = -np.linalg.solve(V, (follow @ W)[..., None])
-    motion = (bundle.common_motion(V, calibration.block.t_CT_m) @ poses).sum(axis=0)[:, 0]
-    moved = np.concatenate([follow[: len(calibration.free)], motion])
-    return np.asarray(moved * max(math.sqrt(left), abs(mean)))
+    poses = -np.linalg.solve(V, np.stack([one @ W for one in shared], axis=-1))
+    motions = (bundle.common_motion(V, calibration.block.t_CT_m) @ poses).sum(axis=0).T
+    P = len(calibration.free)
+    return [np.concatenate([one[:P], motion]) for one, motion in zip(shared, motions, strict=True)]
 
 
 TELL_SHAPE = 4
@@ -725,14 +733,13 @@ def by_the_views(calibration: bundle.Calibration) -> bundle.Covariance:
         enough = calibration.observations.views >= TELL_SHAPE
         # A board whose every corner is estimated has its aspect, too.
         few = len(calibration.block.deformation) <= len(DEFORMATIONS)
-        moved = [stretched(calibration, inflation)] if enough and few else []
         tells = enough and calibration.basis is None
         shape, ran = (shape_or_none(calibration), drift(calibration)) if tells else (None, None)
+        values = shape.values if shape is not None and shape.allowed else None
+        moved = misprinted(calibration, inflation, values) if enough and few else []
     except (np.linalg.LinAlgError, ValueError):
-        inflation, shifts, moved, shape, ran = 1.0, [], [], None, None
+        inflation, shifts, moved, ran = 1.0, [], [], None
     variance = (inflation * calibration.sigma_px) ** 2
-    if shape is not None and shape.allowed:
-        shifts.append(shape.shift)
     known = bundle.covariance(calibration, variance, shifts)
     if ran is not None:
         # What changes is the camera: it may be turned for that, but no pose is nearer than it was.
