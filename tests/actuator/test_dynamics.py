@@ -437,7 +437,7 @@ def mixed(sets: int, seed: int) -> tuple[list[Plant], list[Pump]]:
                 damping_scale=rng.uniform(3, 20),
                 bending_N_per_rad2=rng.uniform(0, 0.3),
                 creep=Creep(rng.uniform(1, 5), rng.uniform(5, 15), -1.0),
-                gravity_mps2=(0.0, 9.81) if i % 5 == 3 else (0.0, 0.0),
+                gravity_mps2=(0.4, 9.81) if i % 5 == 3 else (0.0, 0.0),
             )
         )
         deflation = Orifice(rng.uniform(0.8, 1.2)) if i % 3 == 0 else RateLimit(rng.uniform(0.3, 0.5))

@@ -58,8 +58,8 @@ STATE = (
 LANES = 16
 """Sets side by side; with fewer the compiler leaves the loop scalar, with more nothing is gained."""
 
-LANE_COEFFICIENTS = 20
-"""Rows of the coefficients of `run_lanes`: 13 of the plant, 2 decays, 2 lags, and 3 of the pumps."""
+LANE_COEFFICIENTS = 22
+"""Rows of the coefficients of `run_lanes`: 15 of the plant, 2 decays, 2 lags, and 3 of the pumps."""
 
 
 @inlined
@@ -178,14 +178,14 @@ def run_lanes(
     substeps: int,
     out: FloatArray,
 ) -> None:
-    """As `run` for `LANES` sets without gravity, and pumps of one kind.
+    """As `run` for `LANES` sets, and pumps of one kind.
 
     Lane i of row k of a flat array is at k LANES + i: offsets that are known when compiling are what
     lets the loop over the lanes become vector instructions.
 
     Parameters
     ----------
-    table : (LANE_COEFFICIENTS * LANES,) the first 13 of `Coefficients`, both pumps' decay in half a
+    table : (LANE_COEFFICIENTS * LANES,) the first 15 of `Coefficients`, both pumps' decay in half a
         step, their lags, and the last 3 of `PumpCoefficients`.
     lanes : (12 * LANES,) l, phi, dl, dphi, z1 + z2, z1 - z2, lags, forces, then 1 for a lane that is in
         the model and its number of good steps; written to.
@@ -209,15 +209,15 @@ def run_lanes(
                     table[10 * LANES + i],
                     table[11 * LANES + i],
                     table[12 * LANES + i],
-                    0.0,
-                    0.0,
-                    0,
+                    table[13 * LANES + i],
+                    table[14 * LANES + i],
+                    1,
                 )
-                decay1, decay2 = table[13 * LANES + i], table[14 * LANES + i]
-                falling, laminar = table[17 * LANES + i], table[18 * LANES + i]
-                turbulent = table[19 * LANES + i]
-                one = PumpCoefficients(kind, table[15 * LANES + i], falling, laminar, turbulent)
-                two = PumpCoefficients(kind, table[16 * LANES + i], falling, laminar, turbulent)
+                decay1, decay2 = table[15 * LANES + i], table[16 * LANES + i]
+                falling, laminar = table[19 * LANES + i], table[20 * LANES + i]
+                turbulent = table[21 * LANES + i]
+                one = PumpCoefficients(kind, table[17 * LANES + i], falling, laminar, turbulent)
+                two = PumpCoefficients(kind, table[18 * LANES + i], falling, laminar, turbulent)
                 g1, g2 = static_N[tick, i], static_N[tick, LANES + i]
                 f1, f2 = lanes[8 * LANES + i], lanes[9 * LANES + i]
                 x1, middle1, end1 = advance_pump(one, lanes[6 * LANES + i], f1, g1, decay1, step_s)
@@ -333,8 +333,7 @@ def largest_step_s(plant: Plant) -> float:
 # Many parameter sets under the same commands, as an identification needs them.
 #
 # Sets are taken `LANES` at a time through `run_lanes`, and the blocks are shared among threads, since the
-# kernel releases the interpreter. Plants with gravity need the sine of the angle, which has no vector
-# instruction, and go one by one through `run`. Either way a set gives the same numbers.
+# kernel releases the interpreter.
 
 
 @dataclass(frozen=True)
@@ -350,16 +349,6 @@ class _Task:
     stopped: IntArray
 
 
-def _one(task: _Task, index: int) -> None:
-    plant, pump = task.plants[index], task.pumps[index]
-    c, p = coefficients(plant), pump_coefficients(pump)
-    rows, steps = task.states[index], task.substeps
-    stopped = run(c, p, task.start[index], task.static_N[pump], pump.tick_s, steps, steps, rows)
-    task.stopped[index] = stopped
-    if stopped >= 0:
-        rows[:] = np.nan
-
-
 def _block(task: _Task, indices: Sequence[int]) -> None:
     """Up to `LANES` sets side by side; lanes that are left over repeat the last set."""
     padded = [*indices, *[indices[-1]] * (LANES - len(indices))]
@@ -370,7 +359,7 @@ def _block(task: _Task, indices: Sequence[int]) -> None:
         one, two = pump_coefficients(pump)
         lags_s = one.lag_s, two.lag_s
         decays = [math.exp(-0.5 * h / lag_s) for lag_s in lags_s]
-        table[:, lane] = (*coefficients(task.plants[i])[:13], *decays, *lags_s, *one[2:])
+        table[:, lane] = (*coefficients(task.plants[i])[:15], *decays, *lags_s, *one[2:])
     radius = table[2]
     begin = task.start[padded].T
     lanes = np.empty((12, LANES))
@@ -399,18 +388,12 @@ def _block(task: _Task, indices: Sequence[int]) -> None:
         to[:, 6:] = rows[:, 6:, lane]
 
 
-def _blocks(plants: Sequence[Plant], pumps: Sequence[Pump]) -> tuple[list[list[int]], list[int]]:
-    """Sets that may run side by side, and those that go alone."""
+def _blocks(pumps: Sequence[Pump]) -> list[list[int]]:
+    """Sets that run side by side."""
     alike: dict[int, list[int]] = {}
-    alone = []
-    for i, (plant, pump) in enumerate(zip(plants, pumps, strict=True)):
-        c = coefficients(plant)
-        if c.gravity:
-            alone.append(i)
-        else:
-            alike.setdefault(pump_coefficients(pump)[0].kind, []).append(i)
-    blocks = [group[k : k + LANES] for group in alike.values() for k in range(0, len(group), LANES)]
-    return blocks, alone
+    for i, pump in enumerate(pumps):
+        alike.setdefault(pump_coefficients(pump)[0].kind, []).append(i)
+    return [group[k : k + LANES] for group in alike.values() for k in range(0, len(group), LANES)]
 
 
 def simulate_batch(
@@ -445,10 +428,7 @@ def simulate_batch(
         np.empty((len(plants), len(pwm), len(STATE))),
         np.full(len(plants), -1, dtype=np.int64),
     )
-    blocks, alone = _blocks(plants, pumps)
-    jobs = [partial(_block, task, block) for block in blocks] + [
-        partial(_one, task, index) for index in alone
-    ]
+    jobs = [partial(_block, task, block) for block in _blocks(pumps)]
     if len(jobs) == 1:
         # As in most of a search: a thread would cost a tenth of the work.
         jobs[0]()
