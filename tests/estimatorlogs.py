@@ -91,7 +91,7 @@ def simulated(name: str, seed: int = 0) -> tuple[SimulatedRig, Log]:
 
 def rows_from(log: Log) -> Rows:
     """The log's rows as the estimator gets them."""
-    return rows_of(log, periods(log).ticks)
+    return rows_of(log, periods(log))
 
 
 def truth_of_sensors(rig: SimulatedRig) -> FloatArray:

@@ -8,8 +8,8 @@ Places k. The samples missing before the i-th one, k - i, can only grow, and are
 round((t_i - o) / T) - i. Chunk by chunk is counted on from the line through those just before it, so that the
 count is held to the stamps: one late stamp adds no sample, however many there are. Chunks are as long as the
 line foretells the next one to a quarter of a period, and shorter where the clock bends. Where samples come in
-bursts, as from a buffer that is read now and then, the count goes by bursts, of which the last sample is the
-freshest.
+bursts, as from a buffer that is read now and then, the count goes by bursts. The last sample of one was taken
+up to a period before it was read, and the times are those of the bursts that were read at once.
 
 A clock with steps of about a period lets several samples bear one stamp, or leaves out every few steps. Where
 all stamps are whole steps apart, and stay within one of an even line, that is no lack of samples: they are
@@ -34,7 +34,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -56,6 +56,11 @@ _UNEVEN = 0.25
 """Deviation of the stamps of a steady sensor, in periods, at most."""
 _LATE = 0.05
 """Stamps of a short stretch that may be off by more than half a period."""
+_LATER = 0.15
+"""By how much more than half a period bursts must be late for a missing sample to be counted: they are read
+up to a period after their last sample was taken."""
+_AT_ONCE = 0.05
+"""Share of bursts that are taken to be read at once, or sooner for jitter."""
 _WINDOW = 11
 _LOOKS = 7
 """Looks, at most, at whether gaps are in their places."""
@@ -110,6 +115,7 @@ class TimeAxis:
     jitter_s : robust standard deviation of the stamps about the times.
     steady : whether most samples are of steady stretches.
     repeated : stamps that are that of the sample before.
+    burst : samples of the longest burst, 1 where they do not come in bursts.
     """
 
     stamps_s: FloatArray
@@ -121,6 +127,7 @@ class TimeAxis:
     jitter_s: float
     steady: bool
     repeated: int
+    burst: int = 1
 
     @property
     def rate_hz(self) -> float:
@@ -194,7 +201,9 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
         weighted, samples = float(within.sum()), len(within)
     period = weighted / samples if weighted > 0.0 else math.nan
     jitter = robust_sigma(t - times) if len(t) else 0.0
-    return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()))
+    lasts = _anchors(t) if steady else np.zeros(0, dtype=np.int64)
+    burst = int(np.diff(lasts, prepend=-1).max()) if len(lasts) else 1
+    return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()), burst)
 
 
 def clock_step_s(stamps_s: FloatArray) -> float:
@@ -255,15 +264,18 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     if coarse is not None:
         step, period = coarse
         t, size = _spread(t, step), 2.0 + 2.0 * step / period
-    elif size > 1.0:
-        # One burst may hold a sample more than the next.
-        lag = min(_LAG, len(anchors) - 1)
-        period = float(np.median((t[anchors[lag:]] - t[anchors[:-lag]]) / (anchors[lag:] - anchors[:-lag])))
     window = _WINDOW if coarse is None else 2 * _LONG_LAG + 1
-    k = _counted(t[anchors], i[anchors], period, _UNEVEN * size, window)
-    if k is None:
-        # A gap at the end of the first chunk is counted in the wrong place and bends its line.
-        k = _counted(t[anchors], i[anchors], period, _UNEVEN * size, window, held=True)
+    bursts = len(anchors) < len(t)
+    # One burst may hold a sample more than the next: over few of them that counts, over many what is missing.
+    lags = [lag for lag in (_LAG, _LONG_LAG) if bursts and lag < len(anchors)]
+    periods = [_burst_period(t, anchors, lag) for lag in lags] or [period]
+    uneven, later, k = _UNEVEN * size, _LATER if bursts else 0.0, None
+    # A gap at the end of the first chunk is counted in the wrong place and bends its line.
+    for one, held in product(periods, (False, True)):
+        if k is None or bursts:
+            found = _counted(t[anchors], i[anchors], one, uneven, window, later, held)
+            if k is None or (found is not None and _line(found, t[anchors])[2] < _line(k, t[anchors])[2]):
+                k = found
     if k is None:
         return None
     origin, period, _ = _line(k, t[anchors])
@@ -273,7 +285,9 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
         even = origin + period * k
         wander = _wander(even, t[anchors] - even)
         off = (t[anchors] - even - wander) / period
-        off = np.where(np.abs(off) > 0.5 * size, np.rint(off), 0.0)
+        if bursts:
+            off -= np.quantile(off, _AT_ONCE) + 0.5
+        off = np.where(np.abs(off) > (0.5 + later if bursts else 0.5 * size), np.rint(off), 0.0)
         moved = _with_gaps_in_place(k - anchors, off) + anchors
         if size == 1.0:
             moved = _without_steps(moved, (t - origin) / period - moved)
@@ -284,7 +298,13 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
         origin, period, _ = _line(k, t[anchors])
     # Samples of a burst come before its last; what is missing is missing before the burst.
     places = i + np.repeat(k - anchors, np.diff(anchors, prepend=-1)).astype(np.int64)
-    times = np.maximum.accumulate(origin + period * places + np.interp(places, k, wander))
+    times = origin + period * places + np.interp(places, k, wander)
+    if bursts:
+        # The least late ones tell when their last samples were taken, and none was before the reading before.
+        times += np.quantile(t[anchors] - even - wander, _AT_ONCE)
+        before = np.concatenate([[-math.inf], t[anchors[:-1]]])
+        times = np.maximum(times, np.repeat(before, np.diff(anchors, prepend=-1)))
+    times = np.maximum.accumulate(times)
     off = np.abs(times[anchors] - t[anchors]) / (size * period)
     far = off > 0.5
     # A late stamp stands alone; where neighbours are off as well, or the samples are few, the line is wrong.
@@ -302,6 +322,11 @@ def _rough_period(t: FloatArray, steps: FloatArray) -> float:
     apart = (t[_LAG:] - t[:-_LAG]) / _LAG if len(t) > 2 * _LAG else steps
     apart = apart[np.abs(apart / rough - 1.0) < 0.5 / _LAG]
     return float(np.median(apart)) if len(apart) else rough
+
+
+def _burst_period(t: FloatArray, lasts: IntArray, lag: int) -> float:
+    """The usual time per sample from the last of a burst to that of the one so many bursts on."""
+    return float(np.median((t[lasts[lag:]] - t[lasts[:-lag]]) / (lasts[lag:] - lasts[:-lag])))
 
 
 def _anchors(t: FloatArray) -> IntArray:
@@ -324,9 +349,11 @@ def _running_median(values: FloatArray, window: int = _WINDOW) -> FloatArray:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1))
 
 
-def _on_line(t: FloatArray, i: IntArray, origin: float, period: float, window: int) -> FloatArray:
+def _on_line(
+    t: FloatArray, i: IntArray, origin: float, period: float, window: int, later: float
+) -> FloatArray:
     """Number k (n,) on the line of each of the samples i (n,), rising as they do or faster."""
-    behind = np.rint(_running_median((t - origin) / period - i, window))
+    behind = np.rint(_running_median((t - origin) / period - i, window) - later)
     if bool(np.all(behind[1:] >= behind[:-1])):
         return behind + i
     from scipy.optimize import isotonic_regression
@@ -354,12 +381,12 @@ def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
 
 
 def _counted(
-    t: FloatArray, i: IntArray, period: float, uneven: float, window: int, held: bool = False
+    t: FloatArray, i: IntArray, period: float, uneven: float, window: int, later: float, held: bool
 ) -> FloatArray | None:
     """Numbers k (n,) of the samples i (n,), by `window` of them at a time; None where they are not steady.
 
     Each chunk is counted on from the line through those before it. Where the period is `held` it is still the
-    given one after the first chunk.
+    given one after the first chunk. `later` : as `_LATER`.
     """
     k = np.zeros(len(t))
     first = slice(0, window - _WINDOW + 1)
@@ -368,7 +395,7 @@ def _counted(
     while done < len(t):
         end = min(done + chunk, len(t))
         since = max(done - window, 0)
-        counted = _on_line(t[since:end], i[since:end], origin, period, window)
+        counted = _on_line(t[since:end], i[since:end], origin, period, window, later)
         # Numbers that are known stay; those after them go on rising.
         k[done:end] = counted[done - since :]
         if done:

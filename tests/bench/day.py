@@ -141,7 +141,7 @@ def _stages(
     blocks = list(islice(iter_log(path), count))
     n = sum(len(block) for block in blocks)
     show(f"read {path.suffix}", n, lambda: list(islice(iter_log(path), count)))
-    rows = show("rows for the filter", n, lambda: [rows_of(block, found.ticks) for block in blocks])
+    rows = show("rows for the filter", n, lambda: [rows_of(block, found) for block in blocks])
     outs = show("filter", n, lambda: [estimate(r, b) for r, b in zip(rows, blocks, strict=True)])
     tally = Tally(setup.bellows_radius_m)
     truths = [truth_of(block) for block in blocks]

@@ -127,8 +127,8 @@ def cut(log: Log, pieces: int) -> Iterator[Log]:
 def test_blocks_make_no_difference() -> None:
     rig, log = simulated("ellipse", 1)
     setup, found = setup_for(rig, 1), periods(log)
-    pieces = smooth_log(setup, found.ticks, cut(log, 4))
-    whole = smooth_log(setup, found.ticks, [log])
+    pieces = smooth_log(setup, found, cut(log, 4))
+    whole = smooth_log(setup, found, [log])
     np.testing.assert_array_equal(pieces.out, whole.out)
     before, after = Tally(setup.bellows_radius_m), Tally(setup.bellows_radius_m)
     before.add(pieces.filtered, pieces.truth)

@@ -23,7 +23,7 @@ def _held(axis: TimeAxis, stamps: FloatArray, jitter_s: float) -> None:
     for first, last in zip(axis.starts, [*axis.starts[1:], len(stamps)], strict=True):
         assert axis.places[first] == 0
         assert (np.diff(axis.places[first:last]) > 0).all()
-    assert np.abs(axis.t_s - stamps).max() <= jitter_s
+    assert np.abs(axis.t_s - stamps).max() <= jitter_s * (1.0 + 1e-9)
     assert abs((axis.t_s[-1] - axis.t_s[0]) - (stamps[-1] - stamps[0])) <= 2.0 * jitter_s
     parts = axis.parts(stamps[:, None])
     assert sum(len(part.rows) for part in parts) == len(stamps)
@@ -248,6 +248,20 @@ def test_a_single_burst_before_a_gap_stays(at: int) -> None:
     taken[at:] += 0.3
     stamps = taken[0] + np.ceil(taken / (2.7 * 0.0049)) * 2.7 * 0.0049
     _held(time_axis(stamps), stamps, 2.7 * 0.0049)
+
+
+@pytest.mark.parametrize("periods", [1.7, 2.7, 3.5, 8.3])
+@pytest.mark.parametrize("lost", [0.0, 0.004])
+def test_samples_of_a_buffer_get_the_times_when_they_were_taken(periods: float, lost: float) -> None:
+    """On average they are late by half a period and what they wait for the others of their burst."""
+    rng = np.random.default_rng(1)
+    taken = 0.01 * np.arange(6000)
+    taken = taken[rng.random(len(taken)) >= lost]
+    reads = np.cumsum(np.full(6000, periods * 0.01)) + rng.exponential(3e-4, 6000)
+    axis = time_axis(reads[np.searchsorted(reads, taken)])
+    assert axis.burst > 1
+    assert abs(np.mean(axis.t_s - taken)) < 2.5e-3
+    assert np.std(axis.t_s - taken) < 2.5e-3
 
 
 def test_a_long_gap_splits() -> None:

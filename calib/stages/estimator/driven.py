@@ -1047,8 +1047,8 @@ class Room(NamedTuple):
 
 @kernel(arrays=False)
 def _due(
-    turn: int, stamp: float, tick: float, readings: FloatArray, kinds: int, driven: float, events: Events,
-    memory: Memory, model: Model, z: FloatArray,
+    turn: int, stamp: float, tick: float, taken: float, readings: FloatArray, kinds: int, driven: float,
+    events: Events, memory: Memory, model: Model, z: FloatArray,
 ) -> tuple[int, float]:  # fmt: skip
     """Kind and time of the event that a row brings in a turn, with its reading in z; -1 for none.
 
@@ -1071,7 +1071,7 @@ def _due(
     if turn == 2:
         if not kinds & 2:
             return -1, 0.0
-        when = advance(memory.imu_clock, stamp) - model.imu_delay
+        when = advance(memory.imu_clock, taken) - model.imu_delay
         z[0], z[1], z[2], z[3] = readings[2], readings[3], readings[4], memory.imu_clock[3]
         if math.isnan(z[2]) and (math.isnan(z[0]) or math.isnan(z[1])):
             return -1, 0.0
@@ -1185,10 +1185,10 @@ def _taken(
 
 @kernel(arrays=False)
 def run_driven(
-    t: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray, driven: FloatArray,
-    events: Events, memory: Memory, model: Model, room: Room, out: FloatArray,
+    t: FloatArray, taken: FloatArray, readings: FloatArray, kinds: IntArray, forces: FloatArray,
+    driven: FloatArray, events: Events, memory: Memory, model: Model, room: Room, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Rows (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
+    """Rows (n,), (n,), (n, 5), (n,), (n, 2), (n,) through the ring of the last events; writes `out`.
 
     `driven` says whether a row's command drives the pumps.
     """
@@ -1206,7 +1206,7 @@ def run_driven(
         elif math.isnan(real[_LAST]):
             real[_REJECTED], real[_REJECTED_IMU], real[_FIRST] = 0.0, 0.0, stamp
         real[_LAST] = stamp
-        tick = advance(memory.camera_clock, stamp) if kinds[row] & 1 else stamp
+        tick = advance(memory.camera_clock, taken[row]) if kinds[row] & 1 else stamp
         if not math.isnan(forces[row, 0]):
             whole[_SWITCH] = give(
                 switches, whole[_SWITCH], tick + model.action, forces[row, 0], forces[row, 1], model.period,
@@ -1214,7 +1214,17 @@ def run_driven(
             )  # fmt: skip
         for turn in range(4):
             kind, when = _due(
-                turn, stamp, tick, readings[row], kinds[row], driven[row], events, memory, model, room.z
+                turn,
+                stamp,
+                tick,
+                taken[row],
+                readings[row],
+                kinds[row],
+                driven[row],
+                events,
+                memory,
+                model,
+                room.z,
             )
             if kind < 0:
                 continue
@@ -1295,8 +1305,8 @@ class DrivenFilter:
         driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
         forces = commands(self.drive, pwm, self._held)
         run_driven(
-            rows.t_s, rows.readings, rows.kinds, forces, driven, self._events, self._memory, self._model,
-            self._room, out,
+            rows.t_s, rows.taken_s, rows.readings, rows.kinds, forces, driven, self._events, self._memory,
+            self._model, self._room, out,
         )  # fmt: skip
         return out
 
@@ -1472,7 +1482,7 @@ def _timeline(
     forces = commands(drive, pwm)
     ticks = rows.t_s.copy()
     camera = np.nonzero(rows.kinds & 1)[0]
-    ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])[0]
+    ticks[camera] = even_times(new_clock(setup.camera_period_s), rows.taken_s[camera])[0]
     given = np.isfinite(forces[:, 0])
     action = drive.pump.delay_ticks * drive.pump.tick_s
     switches = _switches(ticks[given] + action, forces[given], setup.command_period_s, drive.pump.lag_s)

@@ -546,7 +546,7 @@ class Setup:
     process : bank of levels.
     camera_period_s, imu_period_s : nominal; NaN takes the stamps as they are.
     command_period_s : of the commands; NaN where each holds until the next, however long.
-    imu_delay_s : age of the IMU's readings.
+    imu_delay_s : age of the IMU's readings. waits_s : how long readings wait for those of their burst.
     """
 
     view: FloatArray
@@ -558,6 +558,7 @@ class Setup:
     imu_period_s: float = math.nan
     command_period_s: float = math.nan
     imu_delay_s: float = 0.0
+    waits_s: float = 0.0
 
     @property
     def delay_s(self) -> float:
@@ -568,7 +569,8 @@ class Setup:
     def ring(self) -> int:
         """How many of the last events a filter keeps: those since the exposure of a late picture."""
         period = self.imu_period_s if self.imu_period_s > 0.0 else 0.002
-        return min(max(16, math.ceil(2.0 * (max(self.delay_s, self.imu_delay_s) + 0.02) / period) + 8), 512)
+        late_s = max(self.delay_s, self.imu_delay_s + self.waits_s)
+        return min(max(16, math.ceil(2.0 * (late_s + 0.02) / period) + 8), 512)
 
 
 @dataclass(frozen=True)
@@ -580,17 +582,25 @@ class Rows:
     t_s : (n,) stamps.
     readings : (n, 5) u, v [px], a_x, a_y [m/s^2], g_z [rad/s].
     kinds : (n,) 1 for the camera's tick, with or without a marker, 2 for an IMU sample, 3 for both.
+    waited_s : (n,) how long before their stamp readings were taken, for those that come in bursts; or (0,).
     """
 
     t_s: FloatArray
     readings: FloatArray
     kinds: IntArray
+    waited_s: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def taken_s(self) -> FloatArray:
+        """What the clocks take for stamps (n,) [s]."""
+        return self.t_s - self.waited_s if len(self.waited_s) else self.t_s
 
     def __len__(self) -> int:
         return len(self.t_s)
 
     def __getitem__(self, part: slice | BoolArray | IntArray) -> Rows:
-        return Rows(self.t_s[part], self.readings[part], self.kinds[part])
+        waited_s = self.waited_s[part] if len(self.waited_s) else self.waited_s
+        return Rows(self.t_s[part], self.readings[part], self.kinds[part], waited_s)
 
 
 # ----------------------------------------------------------------------
@@ -967,10 +977,10 @@ def _write_ahead(
 
 @kernel(arrays=False)
 def run_filter(
-    t: FloatArray, readings: FloatArray, kinds: IntArray, bank: Bank, events: Events, memory: _Memory,
-    model: _Model, room: _Room, out: FloatArray,
+    t: FloatArray, taken: FloatArray, readings: FloatArray, kinds: IntArray, bank: Bank, events: Events,
+    memory: _Memory, model: _Model, room: _Room, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Rows (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT))."""
+    """Rows (n,), (n,), (n, 5), (n,) through the ring of the last events; writes `out` (n, len(OUT))."""
     whole, real, size, count = memory.whole, memory.real, events.t.shape[0], model.levels.shape[0]
     head, head_sigma, report = model.prior, model.prior_sigma, room.report
     z0 = z1 = z2 = late2 = 0.0
@@ -989,13 +999,13 @@ def run_filter(
             if not kinds[row] & kind:
                 continue
             if kind == CAMERA:
-                when, late2 = advance(memory.camera_clock, stamp) - model.delay, memory.camera_clock[3]
+                when, late2 = advance(memory.camera_clock, taken[row]) - model.delay, memory.camera_clock[3]
                 z0, z1, z2 = readings[row, 0], readings[row, 1], math.nan
                 if math.isnan(z0) or math.isnan(z1):
                     continue
                 real[_CAMERA_SEEN] = stamp
             else:
-                when, late2 = advance(memory.imu_clock, stamp) - model.imu_delay, memory.imu_clock[3]
+                when, late2 = advance(memory.imu_clock, taken[row]) - model.imu_delay, memory.imu_clock[3]
                 z0, z1, z2 = readings[row, 2], readings[row, 3], readings[row, 4]
                 if math.isnan(z2) and (math.isnan(z0) or math.isnan(z1)):
                     continue
@@ -1091,8 +1101,8 @@ class Filter:
         """Estimates (n, len(OUT)) at the rows' stamps; call again with the rows that follow."""
         out = np.empty((len(rows), len(OUT)))
         run_filter(
-            rows.t_s, rows.readings, rows.kinds, self._bank, self._events, self._memory, self._model,
-            self._room, out,
+            rows.t_s, rows.taken_s, rows.readings, rows.kinds, self._bank, self._events, self._memory,
+            self._model, self._room, out,
         )  # fmt: skip
         return out
 

@@ -61,6 +61,7 @@ class Periods:
     camera, imu : samples.
     command_s : distance of commands [s], NaN where they are not as steady as a loop's.
     pose : whether the tip's place stands for pictures.
+    camera_burst, imu_burst : samples of the longest burst, 1 where they come one by one.
     """
 
     camera_s: float
@@ -73,6 +74,8 @@ class Periods:
     imu_even: bool = True
     command_s: float = math.nan
     pose: bool = False
+    camera_burst: int = 1
+    imu_burst: int = 1
 
 
 def seen_by(log: Log) -> tuple[str, ...]:
@@ -119,16 +122,24 @@ def periods(log: Log) -> Periods:
     pose = PLACE[0] in log.columns
     return Periods(
         first.period_s, second.period_s, 0.0 if pose else grid_px(readings), use, int(seen.sum()),
-        int(imu.sum()), first.steady, second.steady, usual if steady else math.nan, pose,
+        int(imu.sum()), first.steady, second.steady, usual if steady else math.nan, pose, first.burst,
+        second.burst,
     )  # fmt: skip
 
 
-def rows_of(log: Log, ticks: bool) -> Rows:
+def rows_of(log: Log, found: Periods) -> Rows:
     """A block's rows for the estimator."""
     readings = _readings(log)
-    camera, imu = _kinds(log, readings, ticks)
+    camera, imu = _kinds(log, readings, found.ticks)
     kinds = camera.astype(np.int64) + 2 * imu.astype(np.int64)
-    return Rows(np.asarray(log.t_s, dtype=np.float64), readings, kinds)
+    t = np.asarray(log.t_s, dtype=np.float64)
+    waited = np.zeros(len(t))
+    for rows, burst in ((camera, found.camera_burst), (imu, found.imu_burst)):
+        if burst > 1:
+            own = np.flatnonzero(rows)
+            for part in np.split(own, np.flatnonzero(np.diff(t[own]) < 0.0) + 1):
+                waited[part] = t[part] - time_axis(t[part]).t_s
+    return Rows(t, readings, kinds, waited)
 
 
 def truth_of(log: Log, setup: Setup) -> FloatArray | None:
@@ -492,6 +503,7 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
         camera_period_s=found.camera_s if found.camera_even else math.nan,
         imu_period_s=found.imu_s if found.imu_even else math.nan,
         command_period_s=found.command_s, imu_delay_s=rig.imu_delay_s,
+        waits_s=max(0.0, (found.imu_burst - 1) * found.imu_s, (found.camera_burst - 1) * found.camera_s),
     )  # fmt: skip
     return setup, said
 

@@ -227,7 +227,7 @@ def opened(path: Path, rig: Rig, rig_path: Path, options: LogOptions = NOTHING_S
         remarks.append(first.map.narration)
     stated = rig.estimator is not None or (rig.align is not None and rig.align.jitter_px > 0.0)
     if found.camera and (found.pose or not stated):
-        part = rows_of(first, found.ticks)[:_JITTER_ROWS]
+        part = rows_of(first, found)[:_JITTER_ROWS]
         setup = with_jitter(setup, jitter_px(setup, [part]).value)
     quiet = quiet_shares(rig, found)
     return OpenLog(path, setup, found, first, _noted(chain([first], stream), remarks), quiet, remarks)
@@ -305,6 +305,7 @@ def joined(parts: list[Rows]) -> Rows:
         np.concatenate([part.t_s for part in parts]),
         np.concatenate([part.readings for part in parts]),
         np.concatenate([part.kinds for part in parts]),
+        np.concatenate([part.waited_s for part in parts]),
     )
 
 
@@ -312,7 +313,7 @@ def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
     """Rows (n, len(OUT)) of the kinematic smoother up to a time of the log [s], which may be its end."""
     parts = []
     for block in log.stream:
-        rows = rows_of(block, log.periods.ticks)
+        rows = rows_of(block, log.periods)
         some = rows.t_s <= until_s
         parts.append(rows[some])
         if not some.all():
@@ -339,7 +340,7 @@ def filterpy_log(log: OpenLog, stream: Iterable[Log]) -> tuple[FloatArray, Float
 
     parts, truths = [], []
     for block in stream:
-        parts.append(rows_of(block, log.periods.ticks))
+        parts.append(rows_of(block, log.periods))
         truth = truth_of(block, log.setup)
         truths.append(np.full((len(block), 3), np.nan) if truth is None else truth)
     out, apart = replayed(log.setup, joined(parts))
@@ -347,12 +348,12 @@ def filterpy_log(log: OpenLog, stream: Iterable[Log]) -> tuple[FloatArray, Float
     return out, np.concatenate(truths), Finding("remark", text)
 
 
-def smooth_log(setup: Setup, ticks: bool, stream: Iterable[Log], drive: Drive | None = None) -> Smoothed:
+def smooth_log(setup: Setup, found: Periods, stream: Iterable[Log], drive: Drive | None = None) -> Smoothed:
     """A log filtered block by block and smoothed as a whole; with a `drive` both models are weighed."""
     parts, outs, truths, pwm, driven, kinematic = [], [], [], [], [], []
     fused, both = Filter(setup), None if drive is None else Handover(setup, drive)
     for log in stream:
-        rows, truth = rows_of(log, ticks), truth_of(log, setup)
+        rows, truth = rows_of(log, found), truth_of(log, setup)
         parts.append(rows)
         if both is None:
             outs.append(fused.run(rows))
@@ -811,9 +812,7 @@ def _late(setup: Setup, rows: Rows) -> list[str]:
             while abs(shift) < _LATEST and likelihood(names, shift + step) > likelihood(names, shift):
                 shift += step
             found[names] = max(found.get(names, (-math.inf, 0)), (likelihood(names, shift), shift))
-    # In bursts most samples bear the time of the one before.
-    stamps = np.unique(rows.t_s[(own := np.isfinite(rows.readings[:, 2:]).any(axis=1))])
-    period_ms = 1e3 * float(np.median(np.diff(stamps))) * len(stamps) / own.sum()
+    period_ms = 1e3 * float(np.median(np.diff(rows.taken_s[rows.kinds >= 2])))
     best = max((value for value, _ in found.values()), default=0.0)
     return [
         _TOGETHER[names].format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
@@ -882,7 +881,7 @@ def replay_log(
             write(out[:, _COLUMNS])
         elif smoothed:
             stream = _watched(log.stream, sums.watch, _SMOOTHED_ROWS, "--smooth")
-            whole = smooth_log(log.setup, log.periods.ticks, stream, drive)
+            whole = smooth_log(log.setup, log.periods, stream, drive)
             sums.add(whole.out, whole.truth)
             sensor, longer_m = whole.sensor, whole.longer_m
             filtered = Tally(radius_m)
@@ -968,7 +967,7 @@ def _stream(
 
     with behind(finish) as hand:
         for block in ahead(log.stream):
-            rows = rows_of(block, log.periods.ticks)
+            rows = rows_of(block, log.periods)
             hand((block, rows, estimate(rows, block)))
             done += len(block)
             if progress is not None:
@@ -998,7 +997,7 @@ def _replayed(
         # A sensor that is stuck or mirrored seems late, too; innovations that are white hide no delay.
         repeats = any((check.correlation or 0.0) > _REPEATING for check in checks.values())
         if repeats and all(one.severity != "inconsistent" for one in seen):
-            findings += untimely(log.setup, rows_of(log.first, log.periods.ticks), place)
+            findings += untimely(log.setup, rows_of(log.first, log.periods), place)
         findings += coarse(log)
         findings += captured(log.first, log.periods.pose)
         if log.both and not log.periods.pose:

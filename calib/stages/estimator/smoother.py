@@ -84,9 +84,9 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
     Stamps run through the clocks, which do not look ahead.
     """
     camera, imu = np.nonzero(rows.kinds & 1)[0], np.nonzero(rows.kinds & 2)[0]
-    exposed, camera_s2 = even_times(new_clock(setup.camera_period_s), rows.t_s[camera])
+    exposed, camera_s2 = even_times(new_clock(setup.camera_period_s), rows.taken_s[camera])
     exposed = exposed - setup.delay_s
-    taken, imu_s2 = even_times(new_clock(setup.imu_period_s), rows.t_s[imu])
+    taken, imu_s2 = even_times(new_clock(setup.imu_period_s), rows.taken_s[imu])
     taken = taken - setup.imu_delay_s
     seen = np.isfinite(rows.readings[camera, :2]).all(axis=1)
     camera, exposed = camera[seen], exposed[seen]

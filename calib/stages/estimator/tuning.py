@@ -77,7 +77,7 @@ def tuned_section(
             raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
         parts, commands, count = [], [], 0
         for log in source.stream:
-            parts.append(rows_of(log, source.periods.ticks))
+            parts.append(rows_of(log, source.periods))
             commands.append(pwm_of(log))
             count += len(log)
             if count >= _MOST_ROWS:
