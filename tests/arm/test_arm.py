@@ -20,9 +20,12 @@ from calib.io.columns import QUATERNION, is_arm_log, known_name
 from calib.io.logs import Log, read_log
 from calib.stages.arm.identify import (
     FULL,
+    _coverage,
+    angle_error,
     best_baseline,
     by_pressure,
     errors_by,
+    errors_of,
     fit,
     gained,
     half_width,
@@ -185,6 +188,15 @@ def test_the_interval_of_one_more_trial_follows_from_the_errors_on_held_ones() -
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
     assert half_width([0.1, 0.1, 3.0]) > 3.0 * math.sqrt(3.0)
     assert math.isnan(half_width([1.0]))
+
+
+def test_the_interval_of_trials_without_a_command_is_that_of_their_pressure(trials: list[Trial]) -> None:
+    """There was none."""
+    quiet = [replace(one, command=np.zeros(0)) for one in trials]
+    made = fit(quiet, FULL.without("creep", "load"), SCALE)
+    errors = {one.name: errors_of(made, one) for one in quiet}
+    assert all(0.0 < angle_error(one) < math.radians(1.0) for one in errors.values())
+    assert _coverage(quiet, dict.fromkeys(errors, made), errors) > 0.9
 
 
 # ----------------------------------------------------------------------
@@ -459,6 +471,7 @@ def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:
     found = identify(trials, compare=False)
     assert math.degrees(mean_of(found.held, "angle_by_pressure_rad")) < 0.3
     assert found.fit.scale.finer == 10.0
+    assert found.coverage > 0.9
     assert found.fit.values["bends_rad_per_kpa"] == pytest.approx(0.004, rel=0.03)
     assert found.fit.values["lag_s"] == pytest.approx(1.0, rel=0.05)
     assert found.fit.values["stiffens_per_kpa"] < 2e-4

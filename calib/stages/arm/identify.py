@@ -433,14 +433,24 @@ def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Sc
 
 
 def within(values: Mapping[str, float], trial: Trial, half_rad: float) -> BoolArray:
-    """Which samples (n,) of a trial's angle the free run from its command meets to half an interval."""
-    return np.asarray(np.abs(by_command(trial, values).get("angle_rad", _NONE)) <= half_rad)
+    """Which samples (n,) of a trial's angle a free run meets to half an interval.
+
+    From the command, or from the pressure of a trial without one, as in `angle_error`.
+    """
+    off = by_command(trial, values) or by_pressure(trial, values)
+    return np.asarray(np.abs(off.get("angle_rad", _NONE)) <= half_rad)
+
+
+def angle_error(errors: Errors) -> float:
+    """RMS of the angle from the command, or from the pressure of a trial without one; NaN without a pose."""
+    by = errors["angle_rad"]
+    return by if math.isfinite(by) else errors["angle_by_pressure_rad"]
 
 
 def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[str, Errors]) -> float:
     inside = [_NONE > 0.0]
     for one in trials:
-        wide = half_width([errors[other.name]["angle_rad"] for other in trials if other is not one])
+        wide = half_width([angle_error(errors[other.name]) for other in trials if other is not one])
         if math.isfinite(wide):
             made = held[one.name]
             inside.append(within(values_on(one.day, made.values, made.days), one, wide))

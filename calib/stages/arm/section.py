@@ -45,7 +45,8 @@ class Arm(Result):
     tip_mount : rotation vector of the tip's body in the frame of the base that is taken off, 0 of one that
         starts near the base's attitude.
     tip_zero_rad, tip_grows : of poses in the plane, from what angle they count and with what sign they grow.
-    interval_rad : half the 95 % interval of the angle of a further trial, from the errors on held trials.
+    interval_rad : half the 95 % interval of the angle of a further trial, from the errors on held trials,
+        which are from the pressure where logs have no command.
     coverage : share of the samples of held trials inside the interval that the others' errors give.
     held : free-run errors on each trial from a fit to the others.
     """

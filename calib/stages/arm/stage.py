@@ -124,7 +124,7 @@ def _solve(
 ) -> Arm:
     """From trials, how motion capture is read, and what the recordings show."""
     from calib.core.result import finite_or_none, judged
-    from calib.stages.arm.identify import QUANTITIES, half_width, identify, mean_of
+    from calib.stages.arm.identify import QUANTITIES, angle_error, half_width, identify, mean_of
     from calib.stages.arm.section import Arm, HeldTrial
 
     with progress("identifying") as tell:
@@ -145,7 +145,7 @@ def _solve(
         angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
         chord_error_m=finite_or_none(mean_of(found.held, "chord_m")),
         by_pressure_error_rad=finite_or_none(mean_of(found.held, "angle_by_pressure_rad")),
-        interval_rad=finite_or_none(half_width([one["angle_rad"] for one in found.held.values()])),
+        interval_rad=finite_or_none(half_width([angle_error(one) for one in found.held.values()])),
         coverage=finite_or_none(found.coverage),
         held={
             name: HeldTrial(**{quantity: finite_or_none(one[quantity]) for quantity in QUANTITIES})
