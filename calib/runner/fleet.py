@@ -542,10 +542,16 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
         left_out=folder.left_out,
         stages={job.name: job.status for job in done.ended},
         simulated=rig.simulated,
-        values={f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(rig.values())},
+        values=values_of(rig),
         files={name: sha256(data) for name, data in files.items()},
     )
     return Answer(outcome, files)
+
+
+def values_of(rig: Rig) -> dict[str, tuple[float, float | None]]:
+    """A rig's constants with their deviations, but for sections that their data do not determine."""
+    told = {name: one for name, one in rig.values().items() if one.get("verdict") != "unidentifiable"}
+    return {f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(told)}
 
 
 def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
@@ -638,7 +644,8 @@ def finish(store: Store, manifest: Manifest) -> FleetSummary:
 
 # Columns: name, serial, source, kind, simulated, verdict, code, sentence, reasons, left_out, `verdict.STAGE`
 # for each stage, `SECTION.NAME` and `SECTION.NAME.sigma` for each constant, and at last outlier_z and
-# outlier_of, the constant that stands out most against the fleet. A rig without a number has a null there.
+# outlier_of, the constant that stands out most against the fleet. A null stands where a rig has no number or
+# its data do not determine it.
 
 _FIRST = (
     "name", "serial", "source", "kind", "simulated", "verdict", "code", "sentence", "reasons", "left_out",

@@ -17,7 +17,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.core.constants import constants
 from calib.core.errors import BadInputError
 from calib.core.files import sha256
 from calib.core.result import CovarianceTable
@@ -34,6 +33,7 @@ from calib.runner.fleet import (
     reasons_of,
     run_fleet,
     run_stages,
+    values_of,
     without_secrets,
 )
 from calib.runner.folder import read_folder
@@ -236,9 +236,7 @@ def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
                 status="poor" if poor else "ok",
                 code=int(poor),
                 key="k",
-                values={
-                    f"{one.section}.{one.name}": (one.value, one.sigma) for one in constants(rig.values())
-                },
+                values=values_of(rig),
                 files={"rig.yaml": sha256(text)},
             )
             store.keep(Answer(outcome, {"rig.yaml": text}))
@@ -248,6 +246,14 @@ def _fleet(out: Path, rigs: dict[str, Rig]) -> Iterator[tuple[Store, Manifest]]:
 def _many(seed: int, count: int) -> dict[str, Rig]:
     rng = np.random.default_rng(seed)
     return {f"rig{seed}-{k}": _rig(rng, f"{seed}-{k}") for k in range(count)}
+
+
+def test_what_the_data_do_not_determine_is_compared_with_nothing(tmp_path: Path) -> None:
+    rigs = _many(0, 12)
+    rigs["untold"] = _rig(np.random.default_rng(9), "untold", fx_px=9e6, verdict="unidentifiable")
+    with _fleet(tmp_path, rigs) as (store, manifest):
+        spread = next(one.spread for one in finish(store, manifest).constants if one.name == "camera.fx_px")
+    assert (spread.count, spread.high < 300.0) == (12, True)
 
 
 def test_who_stands_out_is_a_row_that_says_so(tmp_path: Path) -> None:
