@@ -8,12 +8,23 @@ import cv2
 import numpy as np
 import pytest
 from boards import Drawing, charuco, inner_corners, pose, render
+from sets import camera_of
 
 from calib.core.errors import BadInputError
 from calib.io.pictures import list_pictures, read_picture
 from calib.stages.camera.corners import detect, find_size
+from calib.stages.camera.model import FISHEYE, project
 from calib.stages.camera.read import find_boards
-from calib.stages.camera.targets import circle_grid, detect_charuco, find_markers, recognise
+from calib.stages.camera.targets import (
+    Layout,
+    Markers,
+    circle_grid,
+    detect_charuco,
+    find_markers,
+    in_place,
+    recognise,
+    sketch_charuco,
+)
 
 BOARDS = {
     "usual": (charuco(8, 6, cv2.aruco.DICT_4X4_50, 0.75), 0.7),
@@ -52,6 +63,44 @@ def test_corners_against_truth_and_opencv(name: str) -> None:
     assert len(away) > len(opencv)
     assert np.sqrt(np.mean(away**2)) < min(0.02, 0.5 * np.sqrt(np.mean(opencv**2)))
     assert np.abs(away).max() < 0.25
+
+
+@pytest.mark.parametrize("tilt_rad", [0.2, 0.4])
+def test_markers_behind_a_wide_lens_are_in_place(tilt_rad: float) -> None:
+    """Their sides change from one to the next, and no homography places the corners."""
+    layout, camera = Layout("charuco", "4X4_50", 9, 6), camera_of((800, 600), 150.0, (), FISHEYE)
+    R = cv2.Rodrigues(np.array([tilt_rad, tilt_rad, 0.3]))[0]
+    t = np.array([0.5, 0.0, 4.0]) - R @ np.array([4.5, 3.0, 0.0])
+
+    def seen(squares: np.ndarray) -> np.ndarray:
+        return project(camera, np.pad(squares, ((0, 0), (0, 1))) @ R.T + t)
+
+    ids = np.arange(27)
+    corners = layout.places(ids)[:, None] + 0.5 + 0.35 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    markers = Markers(ids, seen(corners.reshape(-1, 2)).reshape(-1, 4, 2))
+    kept, share = in_place(markers, layout)
+    assert len(kept.ids) == 27
+    assert share == pytest.approx(0.7, abs=0.02)
+    sketch = sketch_charuco(np.full((600, 800), 200, dtype=np.uint8), markers, layout)
+    assert sketch is not None
+    inner = np.stack(np.meshgrid(np.arange(1.0, 9.0), np.arange(1.0, 6.0)), axis=-1)
+    true = seen(inner.reshape(-1, 2)).reshape(5, 8, 2)
+    assert np.linalg.norm(sketch[0] - true, axis=2).max() < 0.05 * np.linalg.norm(true[2, 4] - true[2, 3])
+
+
+@pytest.mark.slow
+def test_a_plain_board_in_one_picture_does_not_hide_the_markers(tmp_path: Path) -> None:
+    """As tiles of the floor may pass for."""
+    drawing, blur_px = BOARDS["usual"]
+    j, i = np.mgrid[: 6 * 96, : 8 * 96] // 96
+    plain = Drawing(np.where((i + j) % 2, 255, 0).astype(np.uint8), 8, 6)
+    other = render(plain, *pose(plain, 5, 0.6, 0.1))
+    assert find_size(other) is not None
+    for k, gray in enumerate([*_pictures(drawing, 4, blur_px)[0], other]):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), gray)
+    found = find_boards(list_pictures([tmp_path]), None, 1.0)
+    assert found.layout is not None
+    assert [one.name for one in found.left_out] == ["4.png"]
 
 
 def test_a_charuco_board_is_no_plain_board() -> None:

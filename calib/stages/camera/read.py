@@ -341,10 +341,14 @@ class _Search:
             other = None if self._are_large(found) else self._common_size(sample, share)
             if other is not None and sorted(other) != sorted(wanted):
                 raise BadInputError(_not_found(pictures, wanted, other))
-        if not any(found.values()):
-            layout = self._layout(sample, None)
-            if layout is not None:
+        plain = [i for i in sample if found.get(i)]
+        others = [i for i in sample if not found.get(i)]
+        if len(plain) < len(others):
+            # Tiles of a floor pass for a plain board in some pictures of a board of markers.
+            layout = self._layout(others, None)
+            if layout is not None and (not plain or self._showing(others, layout) > len(plain)):
                 return self._with_markers(corners, layout, layout.dictionary)
+        if not plain:
             other_target = self._asked(targets.name_of, sample)
             if other_target is not None:
                 raise BadInputError(f"{_names(pictures)}: {_shows(pictures)} {other_target}; {_READS}")
@@ -409,6 +413,10 @@ class _Search:
             if layout is not None:
                 return layout
         return None
+
+    def _showing(self, which: Sequence[int], layout: targets.Layout) -> int:
+        """How many of these pictures show a board of markers."""
+        return sum(map(bool, self._each([(targets.shows, i, (layout,)) for i in which], which)))
 
     def _with_markers(
         self, corners: tuple[int, int] | None, layout: targets.Layout | None, dictionary: str

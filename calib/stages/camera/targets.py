@@ -132,7 +132,10 @@ def _markers(quads: Sequence[npt.NDArray[Any]], ids: npt.ArrayLike | None) -> Ma
 
 
 def _steps(markers: Markers) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs (i, j) of neighbours, and where j's centre lies from i's in units of i's sides, (P, 2)."""
+    """Pairs (i, j) of neighbours, and where j's centre lies from i's in units of both's mean sides, (P, 2).
+
+    Sides of one alone would be off by what perspective and lens change from one to the other.
+    """
     quads = markers.quads
     centres = quads.mean(axis=1)
     count = min(_NEIGHBOURS, len(centres) - 1)
@@ -144,7 +147,8 @@ def _steps(markers: Markers) -> tuple[IntArray, IntArray, FloatArray]:
     along = 0.5 * (quads[:, 1] - quads[:, 0] + quads[:, 2] - quads[:, 3])
     down = 0.5 * (quads[:, 3] - quads[:, 0] + quads[:, 2] - quads[:, 1])
     basis = np.stack([along, down], axis=2)
-    step = np.linalg.solve(basis[i] + 1e-12 * np.eye(2), (centres[j] - centres[i])[..., None])[..., 0]
+    both = 0.5 * (basis[i] + basis[j])
+    step = np.linalg.solve(both + 1e-12 * np.eye(2), (centres[j] - centres[i])[..., None])[..., 0]
     return i, j, step
 
 
@@ -292,7 +296,8 @@ _FEWEST_CORNERS = 6
 
 def _place(board: FloatArray, pixels: FloatArray, wanted: FloatArray) -> FloatArray | None:
     """Pixels of points (M, 2) of the board: a homography, and what the lens adds near each."""
-    found, _ = cv2.findHomography(board, pixels, cv2.LMEDS)
+    # Of all points: half of them fit best where a wide lens bends the other half most.
+    found, _ = cv2.findHomography(board, pixels)
     if found is None or not np.all(np.isfinite(found)):
         return None
     H: FloatArray = np.asarray(found, dtype=np.float64)
@@ -304,7 +309,7 @@ def _place(board: FloatArray, pixels: FloatArray, wanted: FloatArray) -> FloatAr
         return None
     apart = np.sum((wanted[:, None] - board) ** 2, axis=2)
     near = np.argsort(apart, axis=1)[:, :_NEAREST]
-    weights = 1.0 / (np.take_along_axis(apart, near, axis=1) + 0.25)
+    weights = 1.0 / (np.take_along_axis(apart, near, axis=1) + 0.25) ** 2
     offset = board[near] - wanted[:, None]
     basis = np.concatenate([np.ones((*near.shape, 1)), offset], axis=2)
     weighted = basis * weights[..., None]
@@ -408,10 +413,15 @@ def sketch_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> tuple[F
     return at.reshape(layout.rows - 1, layout.columns - 1, 2), _paint(gray, own.quads, share)
 
 
+def shows(gray: GrayImage, layout: Layout) -> bool:
+    """Whether a picture shows a board of markers."""
+    markers = find_markers(_reduced(gray, _PROBE_PIXELS), layout.dictionary)
+    return len(in_place(markers, layout)[0].ids) >= _FEWEST_MARKERS
+
+
 def is_mirrored(gray: GrayImage, layout: Layout) -> bool:
     """Whether a picture shows a board of markers as in a mirror, such as a selfie camera stores."""
-    flipped = np.asarray(cv2.flip(_reduced(gray, _PROBE_PIXELS), 1), dtype=np.uint8)
-    return len(in_place(find_markers(flipped, layout.dictionary), layout)[0].ids) >= _FEWEST_MARKERS
+    return shows(np.asarray(cv2.flip(gray, 1), dtype=np.uint8), layout)
 
 
 def detect_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> Detection | None:
@@ -471,8 +481,9 @@ def detect_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> Detecti
     assert grid is not None
     far = np.where(np.isfinite(at), np.clip(at, -1e5, 1e5), 0.0)
     part = np.s_[v0:v1, u0:u1]
+    there = np.all((grid.points > -0.5) & (grid.points < [width - 0.5, height - 0.5]), axis=2)
     sure = (count[part] > 1) | (grid.sigma_px < _UNSURE * np.median(grid.sigma_px[grid.refined]))
-    return _ordered(grid, beside[part] & sure, (int(u0), int(v0)), layout, far)
+    return _ordered(grid, beside[part] & there & sure, (int(u0), int(v0)), layout, far)
 
 
 # ----------------------------------------------------------------------
