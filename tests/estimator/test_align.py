@@ -33,6 +33,8 @@ from calib.stages.align.solve import (
     Stretch,
     _accelerations_at,
     _centred,
+    _from_axis,
+    _leant,
     align,
     best_jitter_px,
     judge,
@@ -358,6 +360,10 @@ def test_a_marker_aside_is_held_by_sigma_or_told(aside_m: float) -> None:
     sensor[at], covariance[at, at] = -2e-3, (1.1 * ASIDE_M) ** 2
     vague = _centred(replace(found, sensor=sensor, covariance=covariance), (5e-5, 1e-5))
     assert vague.aside_m == pytest.approx((-2e-3, 1.1 * ASIDE_M))
+    # It may be the marker from which the IMU is placed, or the plane.
+    across = SENSOR.index("imu_across_m")
+    more = (_from_axis(vague, (5e-5, 1e-5)).covariance - vague.covariance)[across, across]
+    assert more == pytest.approx(vague.sensor[at] ** 2 + vague.covariance[at, at])
 
 
 def test_outliers_dropouts_and_a_blackout_do_little() -> None:
@@ -610,6 +616,26 @@ def test_turned_axes_move_the_quantities_as_a_fit_to_them_does() -> None:
     expected = np.abs(angle * turned(problem, fit))
     assert expected[MOUNT] > 3e-5
     assert np.all(np.abs(moved - expected) < 0.1 * expected + 0.03 * np.sqrt(np.diag(fit.covariance)))
+
+
+def test_gravity_aside_moves_the_quantities_as_a_fit_to_it_does() -> None:
+    """The head's motion comes turned beside gravity; the IMU seemed to sit aside, by ten deviations."""
+    problem, c = _problem(noisy=True)
+    fit, stretch, lean = solve(problem, MEAN, NOISE), problem.stretches[0], 4e-3
+    span, basis = basis_rows(stretch.knots, stretch.imu_s)
+    angle = np.einsum("nj,nj->n", basis[:, 0], c[span[:, None] + np.arange(6), 0]) + TRUTH[MOUNT]
+    resting = TRUTH[1:3] + 9.81 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    readings = stretch.readings.copy()
+    back = np.array([[math.cos(lean), math.sin(lean)], [-math.sin(lean), math.cos(lean)]])
+    readings[:, :2] = resting + (readings[:, :2] - resting) @ back
+    leant = replace(problem, stretches=(replace(stretch, readings=readings),))
+    again = solve(leant, fit.sensor, fit.noise)
+    moved, covariance = again.sensor - fit.sensor, _leant(leant, again)
+    at = SENSOR.index("imu_across_m")
+    assert abs(moved[at]) > 1e-4
+    spread = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(moved) < 1.5 * spread + 0.1 * np.sqrt(np.diag(fit.covariance)))
+    assert spread[at] < 2.5 * abs(moved[at])
 
 
 def test_a_swing_of_four_hertz_is_met_with_its_acceleration() -> None:

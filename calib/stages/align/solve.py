@@ -1028,6 +1028,10 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 # was warmer, of a camera that was moved, or, of the time offset, of a log that was joined to its camera's by
 # itself. To add d to a quantity in one log, which changes its readings by J,
 # has the score g = J' W e and the information I, J' W J less what motion and s explain; d = g / I.
+# Nor need gravity lie along the world's y axis, which is a board's. The mount angle is the one against
+# gravity, so that the head's motion comes turned by that angle; across a swinging head it looks like an IMU
+# that sits aside. By the logs the angle is not told well from it, and the covariance holds what is likely.
+#
 # At rest the mount angle and the bias along y are one number,
 #
 #     atan2((1 + s_y) g sin(alpha) + b_y, (1 + s_x) g cos(alpha) + b_x),
@@ -1042,11 +1046,15 @@ _AX, _AY, _MOUNT, _OFFSET, _MARKER = (
     )
 )  # fmt: skip
 _SX, _SY = SENSOR.index("accel_scale_x"), SENSOR.index("accel_scale_y")
-_SHIFT_X = SENSOR.index("shift_x_m")
+_SHIFT_X, _ACROSS = SENSOR.index("shift_x_m"), SENSOR.index("imu_across_m")
 _SHIFT, _STRETCH = (
     [len(HEAD) + SENSOR.index(f"shift_{axis}_m") for axis in "xy"],
     len(HEAD) + SENSOR.index("stretch"),
 )
+
+
+_LEAN_RAD = 5e-3
+"""How far the world's y axis may stand off the vertical: .3 degrees, as of a board laid by a spirit level."""
 
 
 @dataclass(frozen=True)
@@ -1300,11 +1308,14 @@ Column = Iterator[tuple[Rows, FloatArray, FloatArray, FloatArray]]
 """Rows, what one more quantity changes of their predictions, pull and weight, a chunk at a time."""
 
 
-def _one_more(
-    problem: Problem, fit: Fit, column: Callable[[Stretch, FloatArray], Column], log: int, name: str
-) -> Apart | None:
-    """One more quantity of a log, or of all (-1), as far as the readings tell it beside all others."""
-    right, score, alone, told = np.zeros(len(SENSOR)), 0.0, 0.0, 0.0
+def _beside(
+    problem: Problem, fit: Fit, column: Callable[[Stretch, FloatArray], Column], log: int
+) -> tuple[float, float, float, FloatArray]:
+    """Score of one more quantity of a log, or of all (-1), and information on it alone and beside all others.
+
+    Last, by how much one unit of it moves these (14,).
+    """
+    right, score, alone, taken = np.zeros(len(SENSOR)), 0.0, 0.0, 0.0
     for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
         if log not in (-1, stretch.log):
             continue
@@ -1314,10 +1325,17 @@ def _one_more(
             alone += float((weight * change**2).sum())
             gathered(rows.span, rows.basis, rows.by, weight * change, to_c, right)
         own = fit.arrow.own(i, to_c)
-        told += float(to_c @ own)
+        taken += float(to_c @ own)
         right -= fit.arrow.B[i].T @ own
     moved = cho_solve(fit.arrow.S, right)
-    known = alone - told - float(right @ moved)
+    return score, alone, alone - taken - float(right @ moved), moved
+
+
+def _one_more(
+    problem: Problem, fit: Fit, column: Callable[[Stretch, FloatArray], Column], log: int, name: str
+) -> Apart | None:
+    """One more quantity of a log, or of all (-1), as far as the readings tell it beside all others."""
+    score, alone, known, moved = _beside(problem, fit, column, log)
     if known <= _TOLD * alone:
         return None
     away = score / known
@@ -1375,6 +1393,26 @@ def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
         change[:, 2] = 0.0
         _, pull, weight = imu_terms(stretch.readings[part] - rows.predicted, fit.noise.of(stretch, part))
         yield rows, change, pull, weight
+
+
+def _turned_motion(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
+    """Change of what the accelerometer reads of the motion, by the angle at which gravity stands aside."""
+    s = fit.sensor
+    for off, rows, part in _readings(stretch, c, s):
+        phi = np.einsum("nj,nj->n", rows.basis[:, 0], c[rows.span[:, None] + np.arange(6), 0])
+        # As by the mount angle, which turns gravity too.
+        change = rows.by[:, :, len(HEAD) + _MOUNT].copy()
+        change[:, 0] += (1.0 + s[_SX]) * GRAVITY_MPS2 * np.sin(phi + s[_MOUNT])
+        change[:, 1] -= (1.0 + s[_SY]) * GRAVITY_MPS2 * np.cos(phi + s[_MOUNT])
+        _, pull, weight = imu_terms(off, fit.noise.of(stretch, part))
+        yield rows, change, pull, weight
+
+
+def _leant(problem: Problem, fit: Fit) -> FloatArray:
+    """Covariance (14, 14) by gravity that stands aside of the world's y axis, at what angle is likely."""
+    score, _, known, moved = _beside(problem, fit, partial(_turned_motion, fit), -1)
+    variance = 1.0 / (max(known, 0.0) + _LEAN_RAD**-2)
+    return (variance + (score * variance) ** 2) * np.outer(moved, moved)
 
 
 def _traces(problem: Problem, first: FloatArray, fit: Fit) -> tuple[Trace, ...]:
@@ -1470,6 +1508,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         fit = solve(problem, fit.sensor, fit.noise)
     moved = settings.turn_sigma_rad * turned(problem, fit)
     covariance = fit.covariance + _walked(settings, problem, fit) + np.outer(moved, moved)
+    covariance += _leant(problem, fit)
     # What is left of a delay that was taken out is its deviation.
     apart = [one for one in _apart(problem, fit, len(logs)) if not late or one.name != _LATE]
     for one in [*apart, *(replace(one, moved=one.moved / one.deviations) for one in late)]:
@@ -1491,7 +1530,9 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         max(float(np.ptp(piece.camera.t_s)) for piece in pieces), tuple(apart),
         max(axis.repeated / len(axis.stamps_s) for piece in pieces for axis in (piece.camera, piece.imu)),
     )  # fmt: skip
-    return _centred(found, settings.aside_sigma_m) if settings.aside_sigma_m else found
+    if settings.aside_sigma_m:
+        found = _centred(found, settings.aside_sigma_m)
+    return _from_axis(found, settings.aside_sigma_m)
 
 
 # ----------------------------------------------------------------------
@@ -1548,6 +1589,22 @@ def _centred(found: Alignment, aside_sigma_m: tuple[float, ...]) -> Alignment:
         return replace(centred, aside_m=(value, known))
     told = 1.0 - (known / wide) ** 2
     return replace(centred, aside_m=(value / told, wide * math.sqrt((1.0 - told) / told)))
+
+
+def _from_axis(found: Alignment, aside_sigma_m: tuple[float, ...]) -> Alignment:
+    """An alignment whose IMU is placed from the axis, where the fit places it from the marker.
+
+    What lies aside is the marker by its share in what is likely beforehand; where it is surely more, either.
+    """
+    share, likely = 1.0, 0.0
+    if aside_sigma_m and found.aside_m is None:
+        drawn, calibrated = aside_sigma_m
+        share = 1.0 - (calibrated / drawn) ** 2
+        likely = share * calibrated**2
+    covariance = found.covariance.copy()
+    aside = found.sensor[_SHIFT_X] ** 2 + covariance[_SHIFT_X, _SHIFT_X]
+    covariance[_ACROSS, _ACROSS] += share**2 * aside + likely
+    return replace(found, covariance=covariance)
 
 
 # ----------------------------------------------------------------------
