@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from open_loop import simulate
 from scipy import signal
 
+from calib.core.errors import BadInputError
 from calib.stages.actuator.simulate import RigState
 from calib.stages.control.laws import Channel, Model, Pid, bent_rest, feed_forward_pwm, holding_force
 from calib.stages.control.section import ControllerCriterion
@@ -259,6 +260,21 @@ def test_the_limit_is_used(orientation: Tuned, position: Tuned) -> None:
             for point in tuned.points
         ]
         assert not all(kept)
+
+
+def test_pumps_that_fill_faster_than_the_head_swings_are_controlled() -> None:
+    """No gains were found: the integral was .15 s or more of the gain, and the gain 20 PWM/rad or more."""
+    tuned = tune_orientation(replace(NOMINAL, pump=replace(NOMINAL.pump, lag_s=0.05)), CRITERION)
+    _at_least(tuned)
+    assert tuned.pid.Ki > 10.0 * tuned.pid.Kp > 0.0
+
+
+def test_what_no_gains_hold_is_said_with_its_cause() -> None:
+    with pytest.raises(BadInputError, match=r"sensitivity of 1\.0001 at every"):
+        tune_position(NOMINAL, ControllerCriterion(gain_margin=2.0, phase_margin_rad=1.0, sensitivity=1.0001))
+    heavy = replace(NOMINAL, plant=replace(NOMINAL.plant, mass_kg=0.15, gravity_mps2=(0.0, -9.81)))
+    with pytest.raises(BadInputError, match="does not come to rest by itself but goes away"):
+        tune_orientation(heavy, CRITERION)
 
 
 @pytest.mark.few

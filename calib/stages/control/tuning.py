@@ -678,7 +678,11 @@ def tracking(
 # The ratios Ki / Kp and Kd / Kp come from a grid; for each the largest gain is found by bisection on the
 # frequency responses, which are computed once, and the winner is checked by eigenvalues.
 
-_INTEGRAL_S = np.geomspace(0.15, 4.0, 10)
+_INTEGRAL_S = np.concatenate([np.geomspace(0.01, 0.1, 6), np.geomspace(0.15, 4.0, 10)])
+"""Behind pumps that fill faster than the head swings the gain at its resonance is the limit, and an integral
+far stronger than the gain is what stays below."""
+_LEAST = 1e-5
+"""Of the largest gain: angles are no worse held without a controller."""
 _DERIVATIVE_S = np.array([0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2])
 _BISECTIONS = 16
 
@@ -790,7 +794,7 @@ def _strongest(
             for one in scalar_loops(C[:, None, None] * rig, C[:, None] * together)
         )
 
-    low, high = 1e-3 * most, most
+    low, high = _LEAST * most, most
     if not good(low):
         return 0.0
     for _ in range(_BISECTIONS):
@@ -832,10 +836,26 @@ def _searched(
         worst = [_worst(loop_margins(series(controllers(pid), rig))) for rig in rigs]
         if all(holds(_slack(criterion), one) for one in worst):
             return Tuned(pid, tuple(map(Point, at, worst)))
-    raise BadInputError(
-        f"controller: no gains reach a gain margin of {criterion.gain_margin:g} and a phase margin of "
-        f"{math.degrees(criterion.phase_margin_rad):.3g} deg at every operating point, expected a lower "
-        "demand"
+    raise BadInputError(_hopeless(criterion, at, rigs))
+
+
+def _hopeless(
+    criterion: ControllerCriterion, at: Sequence[tuple[float, float]], rigs: Sequence[System]
+) -> str:
+    """Why not even weak gains keep margins."""
+    for q_m, rig in zip(at, rigs, strict=True):
+        if (radius := spectral_radius(rig)) >= 1.0:
+            q1, q2 = (1e3 * q for q in q_m)
+            grows_s = rig.tick_s / max(math.log(radius), 1e-9)
+            return (
+                f"controller: at lengths of {q1:.1f} and {q2:.1f} mm the head does not come to rest by "
+                f"itself but goes away, 2.7 times as far in {grows_s:.2g} s, expected an actuator that does; "
+                "look at mass_kg, gravity_mps2 and the creep of the actuator in rig.yaml"
+            )
+    phase = f"{math.degrees(criterion.phase_margin_rad):.3g} deg"
+    return (
+        f"controller: no gains reach a gain margin of {criterion.gain_margin:g}, a phase margin of {phase} "
+        f"and a sensitivity of {criterion.sensitivity:g} at every operating point, expected a lower demand"
     )
 
 
