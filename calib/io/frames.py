@@ -1,10 +1,10 @@
-"""Frames of videos and of the image topics of bags: the sharpest of each stretch, in bounded memory."""
+"""Frames of videos and of the image topics of bags: the best of each stretch, in bounded memory."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from calib.core.files import VIDEOS, check_readable, hash_of, is_bag, one_line, 
 from calib.io.pictures import Picture, decoded_picture, eight_bits, fields_of
 
 # ----------------------------------------------------------------------
-# One pass over the frames. A stretch is a run of frames, of which the sharpest is kept; when there are too
+# One pass over the frames. A stretch is a run of frames, of which the best is kept; when there are too
 # many stretches, neighbours are joined and stretches are twice as long from then on. So the number of
 # frames need not be known, and the same file gives the same frames.
 
@@ -32,7 +32,7 @@ _MOST_PIXELS = 200_000_000
 
 @dataclass(frozen=True)
 class Frames:
-    """The sharpest frame of each stretch of a recording.
+    """The best frame of each stretch of a recording.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ def read_frames(path: Path, topic: str | None = None) -> Frames:
     else:
         stream = _of_bag(path, topic)
     name = shown(path.name)
-    kept, count = _sharpest(stream)
+    kept, count = _best(stream)
     if not count:
         raise BadInputError(f"{shown(path)}: holds no picture that can be decoded")
     digest = hash_of(path)
@@ -80,34 +80,62 @@ def read_frames(path: Path, topic: str | None = None) -> Frames:
 @dataclass(frozen=True)
 class _Best:
     number: int
-    sharpness: float
+    worth: float
     gray: GrayImage
 
 
-def _sharpest(stream: Iterable[GrayImage]) -> tuple[list[tuple[int, GrayImage]], int]:
-    """Number and picture of the sharpest frame of each stretch, and how many frames there were."""
+def _best(stream: Iterable[GrayImage]) -> tuple[list[tuple[int, GrayImage]], int]:
+    """Number and picture of the best frame of each stretch, and how many frames there were.
+
+    The best one is sharp and rests: what moves before a rolling shutter is sheared, however sharp.
+    """
     stretches: list[_Best] = []
     length, count = 1, 0
-    for number, gray in enumerate(stream):
+    for number, (gray, moved) in enumerate(_with_motion(stream)):
         count += 1
         most = 2 * max(_FEWEST_STRETCHES, min(_STRETCHES, _KEPT_PIXELS // (2 * gray.size)))
-        one = _Best(number, _sharpness(fields_of(gray)[0]), gray)
+        sharpness = _sharpness(fields_of(gray)[0])
+        one = _Best(number, sharpness**2 / max(sharpness + moved, 1e-9), gray)
         if number // length < len(stretches):
-            stretches[-1] = _sharper(stretches[-1], one)
+            stretches[-1] = _better(stretches[-1], one)
         else:
-            # A decoder may hand out the same memory again.
-            stretches.append(replace(one, gray=gray.copy()))
+            stretches.append(one)
         if len(stretches) > most:
             pairs = [stretches[k : k + 2] for k in range(0, len(stretches), 2)]
-            stretches = [_sharper(pair[0], pair[-1]) for pair in pairs]
+            stretches = [_better(pair[0], pair[-1]) for pair in pairs]
             length *= 2
     return [(one.number, one.gray) for one in stretches], count
 
 
-def _sharper(before: _Best, after: _Best) -> _Best:
-    if after.sharpness <= before.sharpness:
-        return before
-    return replace(after, gray=after.gray.copy())
+def _better(before: _Best, after: _Best) -> _Best:
+    return before if after.worth <= before.worth else after
+
+
+def _with_motion(stream: Iterable[GrayImage]) -> Iterator[tuple[GrayImage, float]]:
+    """Each frame, and the larger of its mean square differences from the one before and the one after.
+
+    Of a camera that gives each frame twice one of them is nothing.
+    """
+    before: GrayImage | None = None
+    moved = 0.0
+    for gray in stream:
+        # A decoder may hand out the same memory again.
+        after = gray.copy()
+        if before is not None:
+            step = _apart(before, after)
+            yield before, max(moved, step)
+            moved = step
+        before = after
+    if before is not None:
+        yield before, moved
+
+
+def _apart(one: GrayImage, other: GrayImage) -> float:
+    """Mean square difference of two frames, 0 of frames of unlike sizes."""
+    if one.shape != other.shape:
+        return 0.0
+    n = 1 + one.size // _SHARPNESS_PIXELS
+    return float(np.mean(np.square(one[::n].astype(np.int16) - other[::n], dtype=np.float32)))
 
 
 def _sharpness(gray: GrayImage) -> float:

@@ -974,8 +974,8 @@ def _of_recording(
     own = [view for view in views if view.name in names]
     kept = {own[k].name for k in most_informative(own, image_size_px)}
     remark = (
-        f"{frames.source}: {frames.count} frames, looked at the sharpest of each of {len(names)} stretches, "
-        f"board in {len(own)}, used {len(kept)} that say most of the camera"
+        f"{frames.source}: {frames.count} frames, looked at the sharpest at rest of each of {len(names)} "
+        f"stretches, board in {len(own)}, used {len(kept)} that say most of the camera"
     )
     return tuple(view for view in views if view.name not in names or view.name in kept), remark
 
