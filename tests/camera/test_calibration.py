@@ -494,6 +494,19 @@ def test_a_skew_is_chosen_where_the_views_show_one(skew_px: float, roll_deg: flo
     assert calibrate_camera(views, (640, 480), Choices("radial2")).calibration.camera.skew_px == 0.0
 
 
+@pytest.mark.few(1)
+@pytest.mark.parametrize("seed", [7, pytest.param(0, marks=pytest.mark.slow)])
+def test_a_decentering_that_the_views_show_is_not_left_out(seed: int) -> None:
+    """In no view does it stand out from the noise, and the centre of a radial lens is 2.5 deviations off."""
+    camera = camera_of(lens=(-0.2, 0.1, 4e-4, -3e-4))
+    views = take(np.random.default_rng(seed), camera, 14)
+    fit = calibrate_camera(views, (640, 480)).calibration
+    assert fit.camera.model == "brown5"
+    sigma = by_the_views(fit).sigma()
+    for name in ("cx_px", "cy_px"):
+        assert abs(getattr(fit.camera, name) - getattr(camera, name)) < 2 * sigma[name]
+
+
 def test_a_sheared_board_is_no_skew() -> None:
     target = np.array([[x, y] for y in range(5) for x in range(7)]) * 0.02
     sheared = target + np.outer(target[:, 1], [0.003, 0.0])

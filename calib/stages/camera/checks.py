@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -414,25 +414,57 @@ class Skew:
     shear_chi2: float
 
 
-def skew_left_out(calibration: bundle.Calibration) -> Skew:
-    """The skew that a calibration without one would have."""
-    free = np.sort(np.append(calibration.free, model.INTRINSICS.index("skew_px")))
-    freed = replace(calibration, free=free)
+@dataclass(frozen=True)
+class LeftOut:
+    """What the views say of intrinsics that a calibration leaves out.
+
+    Attributes
+    ----------
+    step, cov : (k,), (k, k) one step to them, everything else following, and its covariance, the views'
+        overdispersion included.
+    moved_px : root mean square change of the directions seen, in the picture.
+    fall, variance : of the cost, and of a coordinate once it has fallen, the overdispersion included.
+    """
+
+    step: FloatArray
+    cov: FloatArray
+    moved_px: float
+    fall: float
+    variance: float
+
+    @property
+    def chi2(self) -> float:
+        """Of the step, with k degrees of freedom."""
+        return float(self.step @ scaled_inverse(self.cov) @ self.step)
+
+
+def left_out(calibration: bundle.Calibration, names: Sequence[str]) -> LeftOut:
+    """What a calibration without these intrinsics leaves out."""
+    freed = replace(
+        calibration, free=np.union1d(calibration.free, [model.INTRINSICS.index(n) for n in names])
+    )
     found = evidence(freed)
     S, b = found.S.sum(axis=0), found.b.sum(axis=0)
     inverse, fall = scaled_inverse(S), float(gain(S, b))
     step = -inverse @ b
-    left = max(calibration.squared_sum - fall, 0.0) / max(calibration.degrees_of_freedom - 1, 1)
-    # Scatter of the views about the step, where the skew is taken out.
-    inflation = overdispersion(replace(found, b=found.b + found.S @ step, sigma_px=float(np.sqrt(left))))
-    at = found.names.index("skew_px")
+    left = max(calibration.squared_sum - fall, 0.0) / max(calibration.degrees_of_freedom - len(names), 1)
+    # Scatter of the views about the step, where the intrinsics are taken out.
+    about = replace(found, b=found.b + found.S @ step, sigma_px=math.sqrt(left))
+    variance = left * overdispersion(about) ** 2
+    at = [found.names.index(name) for name in names]
+    return LeftOut(step[at], variance * inverse[np.ix_(at, at)], apart_px(freed, step), fall, variance)
+
+
+def skew_left_out(calibration: bundle.Calibration) -> Skew:
+    """The skew that a calibration without one would have."""
+    found = left_out(calibration, ["skew_px"])
     sheared = evidence(calibration, _basis(calibration)[0][..., 1:2, :, :], ("shear",))
     other = float(gain(sheared.S.sum(axis=0), sheared.b.sum(axis=0)))
     return Skew(
-        float(step[at]),
-        inflation * float(np.sqrt(max(inverse[at, at], 0.0) * left)),
-        apart_px(freed, step),
-        (other - fall) / max(left * inflation**2, 1e-300),
+        float(found.step[0]),
+        math.sqrt(max(found.cov[0, 0], 0.0)),
+        found.moved_px,
+        (other - found.fall) / max(found.variance, 1e-300),
     )
 
 

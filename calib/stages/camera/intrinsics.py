@@ -86,6 +86,8 @@ _WIDE = float(np.radians(40.0))
 """Angle from the axis from which on a fisheye lens is tried; below it the radial models follow its curve."""
 _SKEW_SIGMAS, _SKEW_PX = 3.0, 0.01
 """Standard deviations, and pixels by which directions move at up to 1000 pixels' width, that make a skew."""
+_DECENTRED_CHI2 = 11.8
+"""Of the two coefficients of decentering, as likely by chance as three standard deviations."""
 _SOUND = 3
 _BORDER_SHARE = 0.05
 """Standard deviation of projection at the picture's border, over the width, above which a lens is a guess."""
@@ -494,6 +496,9 @@ def _chosen_model(
     candidates, fits, best = compared(asked)
     if not fits:
         return LensModel("radial2", asked), None, ()
+    decentred = next((i for i, fit in enumerate(fits) if fit.camera.model == "brown5"), best)
+    if best < decentred and not _worse(candidates[decentred], candidates[best]) and _decentred(fits[best]):
+        best = decentred
     if choices.skew is None and _skewed(fits[best]):
         others, other_fits, other = compared(True)
         # Decentering that a lens lacks must not pass for skew.
@@ -503,6 +508,17 @@ def _chosen_model(
             return LensModel.of(other_fits[other]), other_fits[other], (*candidates, *others)
         candidates += others
     return LensModel.of(fits[best]), fits[best], tuple(candidates)
+
+
+def _decentred(fit: Calibration) -> bool:
+    """Whether the views show a decentering that a radial lens leaves out, and that matters.
+
+    It passes for another principal point, at an error in each view that is lost in the noise.
+    """
+    if fit.camera.fisheye or "p1" in fit.free_names:
+        return False
+    found = checks.left_out(fit, ("p1", "p2"))
+    return found.chi2 > _DECENTRED_CHI2 and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px)
 
 
 def _skewed(fit: Calibration) -> bool:
