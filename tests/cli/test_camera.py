@@ -288,6 +288,17 @@ def test_another_square_for_as_many_corners_is_doubted(calib, folder, rig) -> No
     assert calib("extrinsics", folder, "--rig", rig).code == 0
 
 
+def test_a_second_board_in_the_picture_is_named(calib, folder, rig) -> None:
+    gray = cv2.imread(str(folder / "plane01.png"), cv2.IMREAD_GRAYSCALE)
+    both = np.full_like(gray, 120)
+    for (v, u), (width, height) in (((0, 0), (172, 113)), ((115, 174), (140, 92))):
+        both[v : v + height, u : u + width] = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(folder / "plane01.png"), both)
+    ended = calib("extrinsics", folder, "--rig", rig)
+    assert ended.code == 1
+    assert "plane01.png: more than one board of 7x5 inner corners is seen" in ended.out
+
+
 def test_a_plane_is_no_better_than_its_camera(calib, folder, rig) -> None:
     rig.write_text(rig.read_text().replace("verdict: ok", "verdict: poor", 1))
     ended = calib("extrinsics", folder, "--rig", rig)

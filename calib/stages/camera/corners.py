@@ -567,6 +567,7 @@ class Detection:
         its place between the others and must not be taken for a measurement.
     contrast : median half step from dark to bright, grey levels.
     misfit_px : typical distance of a corner from where the others, by a smooth fit, place it.
+    alone : whether no other board of this size was seen beside it, with smaller squares.
     """
 
     pixels: FloatArray
@@ -576,6 +577,7 @@ class Detection:
     refined: BoolArray
     contrast: float
     misfit_px: float
+    alone: bool = True
 
 
 def _shows_something(gray: GrayImage) -> bool:
@@ -583,7 +585,7 @@ def _shows_something(gray: GrayImage) -> bool:
     return min(gray.shape) >= 8 and int(gray.max()) - int(gray.min()) >= _LEAST_RANGE
 
 
-def _ordered(grid: Refined, columns: int, rows: int) -> Detection | None:
+def _ordered(grid: Refined, columns: int, rows: int, alone: bool) -> Detection | None:
     turn = canonical_turn(grid.points, grid.amplitude, columns, rows)
     if turn is None:
         return None
@@ -595,19 +597,15 @@ def _ordered(grid: Refined, columns: int, rows: int) -> Detection | None:
         refined=np.rot90(grid.refined, turn).ravel(),
         contrast=float(np.median(np.abs(grid.amplitude))),
         misfit_px=grid.misfit_px,
+        alone=alone,
     )
 
 
-def _best_of(gray: GrayImage, grids: Sequence[FloatArray]) -> Refined | None:
-    """The grid that passes every test; of several the one with the largest squares."""
-    best: Refined | None = None
-    for points in grids:
-        grid = refine(gray, points)
-        if grid is None or fault_of(gray, grid) is not None or any(surroundings(grid).continues):
-            continue
-        if best is None or square_px(grid.points) > square_px(best.points):
-            best = grid
-    return best
+def _boards(gray: GrayImage, grids: Sequence[FloatArray]) -> list[Refined]:
+    """The grids that pass every test, the one with the largest squares first."""
+    refined = [grid for points in grids if (grid := refine(gray, points)) is not None]
+    sound = [g for g in refined if fault_of(gray, g) is None and not any(surroundings(g).continues)]
+    return sorted(sound, key=lambda grid: -square_px(grid.points))
 
 
 def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Detection | None:
@@ -630,9 +628,12 @@ def detect(gray: GrayImage, columns: int, rows: int, quick: bool = False) -> Det
     if not _shows_something(gray):
         return None
     for grids in _candidates(gray, columns, rows, quick):
-        grid = _best_of(gray, grids)
-        if grid is not None:
-            return _ordered(grid, columns, rows)
+        boards = _boards(gray, grids)
+        if boards:
+            centre, *others = (board.points.mean(axis=(0, 1)) for board in boards)
+            near = square_px(boards[0].points)
+            alone = all(np.linalg.norm(other - centre) < near for other in others)
+            return _ordered(boards[0], columns, rows, alone)
     return None
 
 

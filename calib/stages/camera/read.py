@@ -173,6 +173,8 @@ class BoardSearch:
     left_out : pictures that are not used: unreadable, of another size, or without the board.
     hashes : SHA-256 of every picture that could be read by name.
     layout : of the markers of a ChArUco board, which say which way it lies; None for a plain board.
+    several : names of pictures that show more than one board of the size; the one with the largest squares
+        is taken.
     """
 
     board: Board
@@ -181,6 +183,7 @@ class BoardSearch:
     left_out: tuple[LeftOut, ...]
     hashes: dict[str, str]
     layout: targets.Layout | None = None
+    several: tuple[str, ...] = ()
 
 
 def find_boards(
@@ -388,6 +391,7 @@ class _Search:
             ),
             hashes={},
             layout=layout,
+            several=tuple(picture.name for picture, detection in seen if not detection.alone),
         )
 
     def _each(self, jobs: Sequence[_Job], which: Sequence[int]) -> Iterator[Any]:

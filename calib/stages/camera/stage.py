@@ -233,6 +233,7 @@ def _read_plane(
 ]:
     from calib.core.files import shown
     from calib.core.verdict import Finding
+    from calib.core.words import several
     from calib.io.frames import is_recording, read_frames
     from calib.io.pictures import list_pictures
     from calib.stages.camera.model import View
@@ -282,6 +283,13 @@ def _read_plane(
     views, orientation, doubts = [], [], list[Finding]()
     if other := another_square(folder, stated):
         doubts.append(Finding("poor", *other))
+    if search.several and stated.first_corner_px is None:
+        columns, rows = stated.corners
+        text = (
+            f"{several(search.several)}: more than one board of {columns}x{rows} inner corners is seen, and "
+            "the one with the largest squares was taken"
+        )
+        doubts.append(Finding("poor", text, "cover the other, or state first_corner_px in board.yaml"))
     for view in search.views:
         pixels, kept, how = view.pixels, view.measured, "The board's markers say which corner is (0, 0)."
         assert kept is not None
