@@ -1496,8 +1496,10 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         _followed(stretch, c, fit) for stretch, c in zip(problem.stretches, fit.coefficients, strict=True)
     )
     if any(stretch.missed.any() for stretch in followed):
-        problem = replace(problem, stretches=followed)
-        fit = solve(problem, fit.sensor, fit.noise)
+        problem, sensor, noise = replace(problem, stretches=followed), fit.sensor, fit.noise
+        # The next factors take the place of these in memory.
+        del fit
+        fit = solve(problem, sensor, noise)
     late = [one for one in _apart(problem, fit, 1) if one.name == _LATE]
     for one in late:
         at_once = tuple(
