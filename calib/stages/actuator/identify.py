@@ -591,6 +591,8 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
 # Both are looked at where the search starts and again at the solution.
 
 CANDIDATES = 32
+_APART, _FASTER = 0.7, 2.0
+"""Of the candidates' parameters, by their logarithms; of lags twice as much again towards fast pumps."""
 VAGUE = 0.5
 _SAME = 0.99995
 _CONTRARY = 4.0
@@ -825,11 +827,12 @@ def _spread(problem: Problem, values: Mapping[str, float]) -> FloatArray:
     x = first_guess(problem, values)
     out = np.tile(x, (CANDIDATES, 1))
     P = len(problem.names)
-    apart = rng.uniform(-0.7, 0.7, (CANDIDATES - 1, P))
+    apart = rng.uniform(-_APART, _APART, (CANDIDATES - 1, P))
+    if "lag_s" in problem.names:
+        at = problem.names.index("lag_s")
+        apart[:, at] = _FASTER * (apart[:, at] - _APART) + apart[:, at]
     out[1:, :P] *= np.exp(apart)
     u = problem.unknowns
-    stated = np.flatnonzero(np.isfinite(u.sigma[:P]))
-    out[1:, stated] = u.mean[stated] + u.sigma[stated] * apart[:, stated]
     out[:, :P] = np.clip(out[:, :P], u.low[:P] * 1.001, u.high[:P] * 0.999)
     return out
 
@@ -984,7 +987,10 @@ def _again(
 ) -> Solution:
     """The minimum of another problem with the same logs, from values and the solution's starts and delays."""
     why = dict(fixed)
-    minimum = solve(problem, _moved(solution, problem, values), 40)
+    coarse = _coarse(problem)
+    found, *_ = solve(coarse, _moved(solution, coarse, values), 25)
+    starts = np.array([_moved(solution, problem, values), _whole(problem, coarse, found)])
+    minimum = solve(problem, starts[int(np.argmin(_robust(problem, residuals(problem, starts))))], 40)
     told, (x, cost, residual, J) = _all_told(problem, minimum, why)
     return Solution(told, x, residual, J, cost, why, solution.agreeing, solution.starts, solution.law)
 
@@ -1028,11 +1034,31 @@ def _without_creep(solution: Solution) -> Solution:
     return plainer if plainer.cost < _alike(solution.cost) else solution
 
 
+def _coarse(problem: Problem) -> Problem:
+    """The problem for a search: rough, and what is known beforehand stays at that.
+
+    Far from a minimum readings outweigh all priors. A search that may leave them ends far along a valley, in
+    which it hardly comes back: all forces and the mass may grow together, and the springs with their length.
+    """
+    of = list(zip(problem.names, problem.unknowns.mean.tolist(), problem.unknowns.sigma, strict=False))
+    given = {name: mean for name, mean, sigma in of if math.isfinite(sigma)}
+    names = tuple(name for name in problem.names if name not in given)
+    return replace(problem, names=names, held={**problem.held, **given}, rough=True)
+
+
+def _whole(problem: Problem, coarse: Problem, x: FloatArray) -> FloatArray:
+    """Unknowns of a problem from those of its coarse one."""
+    out = first_guess(problem, coarse.values(x))
+    out[len(problem.names) :] = x[len(coarse.names) :]
+    return out
+
+
 def _search(
     problem: Problem, known: Mapping[str, float], progress: Progress | None
 ) -> tuple[_Minimum, int, int]:
     """The best of several refined starts, how many agree with it, and of how many."""
-    spread, rough = _spread(problem, known), replace(problem, rough=True)
+    rough = _coarse(problem)
+    spread = _spread(rough, known)
     order = np.argsort(_robust(rough, residuals(rough, spread)), kind="stable")[:_REFINED].tolist()
     if 0 not in order:
         order.append(0)
@@ -1045,8 +1071,8 @@ def _search(
         if not costs or cost < min(costs):
             best, limit = x, _alike(cost)
         costs.append(cost)
-    final = solve(problem, best, 40)
-    agreeing = sum(cost <= _alike(final[1]) for cost in costs)
+    final = solve(problem, _whole(problem, rough, best), 40)
+    agreeing = sum(cost <= _alike(min(costs)) for cost in costs)
     return final, agreeing, len(order) if math.isfinite(final[1]) else 0
 
 

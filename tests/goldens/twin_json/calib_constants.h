@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xBCECEF9BUL
+#define CALIB_ID 0x638EBBA1UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -237,11 +237,11 @@
 #define CALIB_FUSED_DELAY_TICKS 1.50148654f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000253142876f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 5.87527256e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.20746755e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_1 -4.2074671e-06f /* row 1, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_21 -5.77475066e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000257549371f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.74423185e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00250805076f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_2 -1.74423167e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00250805053f /* K_a, share of the accelerometer's residual */
 #define CALIB_FUSED_ACCEL_WEAK 0.000255662657f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00819336623f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.74755252e-05f /* bias times the same, rad */
@@ -312,9 +312,9 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.206848f, 139.688202f, 149.11087f, 157.536209f, 165.439346f,
-    173.068787f, 180.588623f, 188.158234f, 195.946121f, 204.162064f, 213.161301f,
-    223.748032f, 240.517792f, 253.5f,
+    99.75f, 128.206879f, 139.688248f, 149.110931f, 157.53627f, 165.439423f,
+    173.068863f, 180.588715f, 188.15834f, 195.946259f, 204.162216f, 213.161484f,
+    223.748291f, 240.51857f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */

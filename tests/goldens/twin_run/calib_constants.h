@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x03E40A94UL
+#define CALIB_ID 0xE256FB75UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -222,7 +222,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0649774522f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0649774596f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -237,19 +237,19 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.51306105f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000257227104f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.77291269e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 2.07335834e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.766232e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000257587642f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -8.50324705e-06f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00252342247f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000257229607f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000257227046f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.77291178e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 2.07335779e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.76623109e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000257587584f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -8.50324432e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00252342201f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000257229549f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00827221386f /* dt / 2 over the gyroscope's scale, s */
 #define CALIB_FUSED_HALF_BIAS_RAD 4.95613749e-05f /* bias times the same, rad */
 #define CALIB_FUSED_PHI_PER_M 0.373099536f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.2646184f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5292368f /* the same after a start, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.26461792f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5292358f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00252451003f /* K_b, share of the correction */
 #define CALIB_FUSED_MOVING_LENGTH 0.187839478f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00685632462f /* K_v, per tick */
@@ -309,19 +309,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0649774522f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0649774596f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.230682f, 139.722427f, 149.154312f, 157.58725f, 165.497482f,
-    173.136276f, 180.664154f, 188.244781f, 196.045578f, 204.277725f, 213.306534f,
-    223.945557f, 241.118988f, 253.5f,
+    99.75f, 128.230698f, 139.722443f, 149.154327f, 157.587265f, 165.497498f,
+    173.136307f, 180.664185f, 188.244812f, 196.045609f, 204.277771f, 213.306595f,
+    223.945633f, 241.119232f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0449774489f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.114977449f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0449774563f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.114977457f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */

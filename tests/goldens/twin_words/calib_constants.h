@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x9485B90BUL
+#define CALIB_ID 0x66E049A6UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -235,7 +235,7 @@
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
 #define CALIB_FUSED_DELAY_TICKS 1.48388946f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000251311256f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_11 0.000251311227f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 5.78847903e-06f /* row 1, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_1 -3.86873489e-06f /* row 1, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_21 -5.69220128e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
@@ -312,13 +312,13 @@
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.272629f, 139.782639f, 149.230743f, 157.677063f, 165.599762f,
-    173.255051f, 180.797043f, 188.397064f, 196.220551f, 204.481247f, 213.562103f,
-    224.293121f, 242.176849f, 253.5f,
+    99.75f, 128.272614f, 139.782639f, 149.230743f, 157.677063f, 165.599762f,
+    173.255051f, 180.797043f, 188.397064f, 196.220551f, 204.481232f, 213.562103f,
+    224.293121f, 242.176834f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0451932326f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0451932363f /* shortest length of a bellows, m */
 #define CALIB_ENVELOPE_GREATEST_M 0.115193233f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
