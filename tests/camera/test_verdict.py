@@ -523,6 +523,31 @@ def test_boards_at_the_border_of_a_fisheye_are_views(monkeypatch: pytest.MonkeyP
     assert set(view_faults(pack(views))) != {""}
 
 
+def test_boards_beside_a_wide_lens_are_not_mirrored() -> None:
+    """Two face the camera and turn their fronts away from the picture; a mirrored one is named."""
+    camera = Camera(FISHEYE, (640, 480), 190.0, 190.0, 0.0, 320.0, 240.0, np.zeros(8))
+    board, rng = Board(7, 5, 0.02), np.random.default_rng(0)
+    flat = np.column_stack([board.points_m() - [0.06, 0.04], np.zeros(35)])
+
+    def seen(k: int, angle: float, tilt: float, mirror: float = 1.0) -> View:
+        place = 0.15 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        R = (
+            rotation_exp(np.array([[0.0, angle + tilt, 0.0]]))[0]
+            @ rotation_exp(rng.normal(0, 0.25, (1, 3)))[0]
+        )
+        pixels = project(camera, flat * [mirror, 1.0, 1.0] @ R.T + place)
+        return View(f"{k}", board.points_m(), pixels + rng.normal(0, 0.05, pixels.shape))
+
+    views = [seen(k, 0.25 * (k - 5), 0.4 * (-1) ** k) for k in range(11)]
+    views += [seen(11, 1.2, 0.7), seen(12, -1.2, -0.7)]
+    fit, verdict = _judged(views, camera.image_size_px, FISHEYE)
+    assert (fit.block.R_CT[:, 2, 2] < 0).sum() >= 2
+    assert "mirrored" not in str(verdict)
+    assert "13 shows the board mirrored" in str(
+        _judged([*views, seen(13, 0.3, 0.4, -1.0)], (640, 480), FISHEYE)[1]
+    )
+
+
 @pytest.mark.parametrize("near", [False, True])
 def test_near_and_far_views_that_differ_are_no_lens_that_moved(near: bool) -> None:
     rng, camera = np.random.default_rng(3), camera_of()

@@ -449,7 +449,8 @@ def _radius_share(calibration: bundle.Calibration) -> float:
 def _of_frame(calibration: bundle.Calibration) -> Iterator[Finding]:
     """Points listed mirrored, and the principal point in the picture."""
     camera = calibration.camera
-    mirrored = calibration.block.R_CT[:, 2, 2] < 0.0
+    # By its normal and the way to it: beside a wide lens a board's front may face away from the picture.
+    mirrored = np.einsum("ni,ni->n", calibration.block.R_CT[:, :, 2], calibration.block.t_CT_m) < 0.0
     if mirrored.any() and not mirrored.all():
         fewer = mirrored if mirrored.mean() <= 0.5 else ~mirrored
         names = [calibration.observations.names[i] for i in np.flatnonzero(fewer)]
