@@ -183,7 +183,8 @@ class Log(InWords):
         values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
         stamps = log.t_s[rows]
         same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
-        twice = (np.diff(stamps) == 0.0) & same
+        # Of a burst, in which rows of other sensors lie between, both are readings.
+        twice = (np.diff(stamps) == 0.0) & (np.diff(rows) == 1) & same
         if twice.any():
             kept = np.concatenate([[True], ~twice])
             rows, stamps, values = rows[kept], stamps[kept], values[kept]

@@ -201,7 +201,7 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
         weighted, samples = float(within.sum()), len(within)
     period = weighted / samples if weighted > 0.0 else math.nan
     jitter = robust_sigma(t - times) if len(t) else 0.0
-    lasts = _anchors(t) if steady else np.zeros(0, dtype=np.int64)
+    lasts = _anchors(t) if steady and _coarse(t) is None else np.zeros(0, dtype=np.int64)
     burst = int(np.diff(lasts, prepend=-1).max()) if len(lasts) else 1
     return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()), burst)
 

@@ -69,6 +69,15 @@ def test_rows_that_were_written_twice_are_one_sample() -> None:
     assert np.array_equal(signals["ax_mps2"], log.columns["ax_mps2"])
 
 
+def test_alike_pictures_of_a_burst_are_readings_of_their_own() -> None:
+    """At rest, or between whole pixels: with rows of the IMU between them they were not written twice."""
+    picture = np.arange(3000) % 2 == 0
+    columns = {"u_px": np.where(picture, 100.0, np.nan), "gz_radps": np.where(picture, np.nan, 0.0)}
+    t = np.repeat(0.04 * np.arange(375), 8)
+    signals = Log("log.csv", t, columns, np.arange(2, 3002)).signals("u_px")
+    assert (len(signals), signals.repeated_rows) == (1500, 0)
+
+
 @pytest.mark.parametrize(
     ("changes", "severity", "words"),
     [

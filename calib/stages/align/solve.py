@@ -1188,12 +1188,23 @@ def clock_sigma_s(piece: Piece) -> float:
     step = clock_step_s(np.concatenate([axis.stamps_s for axis in axes]))
     if step < _LEAST_STEP_S or max(axis.jitter_s for axis in axes) < _OFF_GRID * step:
         return 0.0
-    phases = (np.exp(2j * np.pi * axis.t_s / step) for axis in axes)
-    locked = [
-        1.0 if step > COARSE[1] * axis.period_s else abs(phase.mean())
-        for axis, phase in zip(axes, phases, strict=True)
-    ]
-    return math.hypot(*locked) * step / math.sqrt(12.0)
+    buffered = all(axis.burst > 1 for axis in axes)
+    return math.hypot(*(_step_s(axis, step, buffered) for axis in axes)) / math.sqrt(12.0)
+
+
+def _step_s(axis: TimeAxis, step_s: float, buffered: bool) -> float:
+    """Of a clock's step the share by which all of a sensor's times may be off [s].
+
+    Times of a burst end at its stamp, and those that share a step are spread about it. So where all sensors
+    are `buffered` steps do not part them, and what is unknown is how late in a period buffers are read.
+    """
+    if buffered:
+        lasts = np.append(np.diff(axis.stamps_s) > 0.5 * axis.period_s, True)
+        late = (axis.stamps_s - axis.t_s)[lasts] / axis.period_s
+        return axis.period_s * abs(complex(np.exp(2j * np.pi * late).mean()))
+    if step_s > COARSE[1] * axis.period_s:
+        return step_s
+    return step_s * abs(complex(np.exp(2j * np.pi * axis.t_s / step_s).mean()))
 
 
 def _pace(pieces: Sequence[Piece], offset_s: float) -> tuple[float, float]:
