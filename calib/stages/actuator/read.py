@@ -484,8 +484,8 @@ def release_s(log: Log, t_s: FloatArray, phi: FloatArray, noise_rad: float) -> f
     if k is None:
         return None
     rate = rate - np.median(rate[: min(k, int(np.searchsorted(gyro.t_s, gyro.t_s[0] + _HELD_S, "right")))])
-    rise = (rate[k + 1] - rate[k]) / (gyro.t_s[k + 1] - gyro.t_s[k])
-    since = rate[k] / rise if rise * rate[k] > 0.0 else 0.0
+    rise = rate[k + 1] - rate[k]
+    since = rate[k] / rise * (gyro.t_s[k + 1] - gyro.t_s[k]) if rise * rate[k] > 0.0 else 0.0
     return float(gyro.t_s[k] - min(since, gyro.t_s[k] - gyro.t_s[k - 1]))
 
 
