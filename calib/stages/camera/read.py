@@ -345,7 +345,7 @@ class _Search:
             if other is not None and sorted(other) != sorted(wanted):
                 raise BadInputError(_not_found(pictures, wanted, other))
         plain = [i for i in sample if found.get(i)]
-        others = [i for i in sample if not found.get(i)]
+        others = [i for i in sample if not found.get(i) and i not in self.damaged]
         if len(plain) < len(others):
             # Tiles of a floor pass for a plain board in some pictures of a board of markers.
             layout = self._layout(others, None)
