@@ -187,13 +187,13 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
     usual = float(np.median(rising)) if len(rising) else 0.0
     starts = np.flatnonzero(np.concatenate([[True], steps > max(SPLIT_S, 5.0 * usual)])[: len(t)])
     times, places = t.copy(), np.zeros(len(t), dtype=np.int64)
-    samples, weighted, even = 0, 0.0, np.zeros(len(starts), dtype=np.bool_)
+    samples, weighted, even, burst = 0, 0.0, np.zeros(len(starts), dtype=np.bool_), 1
     for k, (first, last) in enumerate(_stretches(starts, len(t))):
         places[first:last] = np.arange(last - first)
         stretch = _steady(t[first:last])
         if stretch is not None:
-            times[first:last], places[first:last], period = stretch
-            even[k] = True
+            times[first:last], places[first:last], period, longest = stretch
+            even[k], burst = True, max(burst, longest)
             weighted, samples = weighted + period * (last - first), samples + last - first
     steady = 2 * samples > len(t)
     if not samples and len(t) > 1:
@@ -201,8 +201,7 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
         weighted, samples = float(within.sum()), len(within)
     period = weighted / samples if weighted > 0.0 else math.nan
     jitter = robust_sigma(t - times) if len(t) else 0.0
-    lasts = _anchors(t) if steady and _coarse(t) is None else np.zeros(0, dtype=np.int64)
-    burst = int(np.diff(lasts, prepend=-1).max()) if len(lasts) else 1
+    burst = burst if steady else 1
     return TimeAxis(t, times, places, starts, even, period, jitter, steady, int((steps == 0.0).sum()), burst)
 
 
@@ -251,8 +250,8 @@ def _stretches(starts: IntArray, n: int) -> Iterator[tuple[int, int]]:
     return pairwise([*starts.tolist(), n])
 
 
-def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
-    """Times, places and period of a stretch; None for a sensor that is not steady."""
+def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | None:
+    """Times, places, period and longest burst of a stretch; None for a sensor that is not steady."""
     steps = np.diff(t)
     steps = steps[steps > 1e-6]
     if len(t) < _LEAST_SAMPLES or len(steps) < _LEAST_SAMPLES // 2:
@@ -269,16 +268,16 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
     # One burst may hold a sample more than the next: over few of them that counts, over many what is missing.
     lags = [lag for lag in (_LAG, _LONG_LAG) if bursts and lag < len(anchors)]
     periods = [_burst_period(t, anchors, lag) for lag in lags] or [period]
-    uneven, later, k = _UNEVEN * size, _LATER if bursts else 0.0, None
+    later, far = (_LATER, 0.5 + _LATER) if bursts else (0.0, 0.5 * size)
+    lines: list[tuple[tuple[float, float, float], FloatArray]] = []
     # A gap at the end of the first chunk is counted in the wrong place and bends its line.
     for one, held in product(periods, (False, True)):
-        if k is None or bursts:
-            found = _counted(t[anchors], i[anchors], one, uneven, window, later, held)
-            if k is None or (found is not None and _line(found, t[anchors])[2] < _line(k, t[anchors])[2]):
-                k = found
-    if k is None:
+        if bursts or not lines:
+            k = _counted(t[anchors], i[anchors], one, _UNEVEN * size, window, later, held)
+            lines += [] if k is None else [(_line(k, t[anchors]), k)]
+    if not lines:
         return None
-    origin, period, _ = _line(k, t[anchors])
+    (origin, period, _), k = min(lines, key=lambda one: one[0][2])
     if not period > 0.0:
         return None
     for look in range(_LOOKS):
@@ -287,7 +286,7 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
         off = (t[anchors] - even - wander) / period
         if bursts:
             off -= np.quantile(off, _AT_ONCE) + 0.5
-        off = np.where(np.abs(off) > (0.5 + later if bursts else 0.5 * size), np.rint(off), 0.0)
+        off = np.where(np.abs(off) > far, np.rint(off), 0.0)
         moved = _with_gaps_in_place(k - anchors, off) + anchors
         if size == 1.0:
             moved = _without_steps(moved, (t - origin) / period - moved)
@@ -306,14 +305,14 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float] | None:
         times = np.maximum(times, np.repeat(before, np.diff(anchors, prepend=-1)))
     times = np.maximum.accumulate(times)
     off = np.abs(times[anchors] - t[anchors]) / (size * period)
-    far = off > 0.5
+    wrong = off > 0.5
     # A late stamp stands alone; where neighbours are off as well, or the samples are few, the line is wrong.
-    if _running_median(far.astype(np.float64)).any() or (len(t) < _RECENT and far.mean() > _LATE):
+    if _running_median(wrong.astype(np.float64)).any() or (len(t) < _RECENT and wrong.mean() > _LATE):
         return None
     # Of few stamps that are their own times none tells a late one from a wrong line.
     if len(t) < 2 * _FIRST and off.max() > (_UNEVEN if np.median(off) > 1e-6 else 1e-3):
         return None
-    return times, places - places[0], period
+    return times, places - places[0], period, int(np.diff(anchors, prepend=-1).max())
 
 
 def _rough_period(t: FloatArray, steps: FloatArray) -> float:

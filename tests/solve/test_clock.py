@@ -23,7 +23,7 @@ def _held(axis: TimeAxis, stamps: FloatArray, jitter_s: float) -> None:
     for first, last in zip(axis.starts, [*axis.starts[1:], len(stamps)], strict=True):
         assert axis.places[first] == 0
         assert (np.diff(axis.places[first:last]) > 0).all()
-    assert np.abs(axis.t_s - stamps).max() <= jitter_s * (1.0 + 1e-9)
+    assert np.abs(axis.t_s - stamps).max() <= jitter_s
     assert abs((axis.t_s[-1] - axis.t_s[0]) - (stamps[-1] - stamps[0])) <= 2.0 * jitter_s
     parts = axis.parts(stamps[:, None])
     assert sum(len(part.rows) for part in parts) == len(stamps)
@@ -247,21 +247,27 @@ def test_a_single_burst_before_a_gap_stays(at: int) -> None:
     taken = 0.0049 * np.arange(2928)
     taken[at:] += 0.3
     stamps = taken[0] + np.ceil(taken / (2.7 * 0.0049)) * 2.7 * 0.0049
-    _held(time_axis(stamps), stamps, 2.7 * 0.0049)
+    # To the digit of rounding.
+    _held(time_axis(stamps), stamps, 2.7 * 0.0049 + 1e-12)
 
 
-@pytest.mark.parametrize("periods", [1.7, 2.7, 3.5, 8.3])
-@pytest.mark.parametrize("lost", [0.0, 0.004])
-def test_samples_of_a_buffer_get_the_times_when_they_were_taken(periods: float, lost: float) -> None:
-    """On average they are late by half a period and what they wait for the others of their burst."""
-    rng = np.random.default_rng(1)
-    taken = 0.01 * np.arange(6000)
-    taken = taken[rng.random(len(taken)) >= lost]
-    reads = np.cumsum(np.full(6000, periods * 0.01)) + rng.exponential(3e-4, 6000)
-    axis = time_axis(reads[np.searchsorted(reads, taken)])
-    assert axis.burst > 1
-    assert abs(np.mean(axis.t_s - taken)) < 2.5e-3
-    assert np.std(axis.t_s - taken) < 2.5e-3
+@pytest.mark.parametrize(
+    ("periods", "lost", "within_s"),
+    [(1.7, 0.0, 5e-4), (2.7, 0.0, 5e-4), (3.5, 0.0, 5e-4), (8.3, 0.0, 1e-3), (12.3, 0.0, 2e-3),
+     (2.7, 0.004, 4e-3), (3.5, 0.004, 2e-3), (8.3, 0.004, 5e-3), (12.3, 0.004, 8e-3)],
+)  # fmt: skip
+def test_samples_of_a_buffer_get_the_times_when_they_were_taken(
+    periods: float, lost: float, within_s: float
+) -> None:
+    """They wait up to a period, and for the others of their burst; where some are lost a period is unsure."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        taken = 0.01 * np.arange(6000)
+        taken = taken[rng.random(len(taken)) >= lost]
+        reads = np.cumsum(np.full(6000, periods * 0.01)) + rng.exponential(3e-4, 6000)
+        axis = time_axis(reads[np.searchsorted(reads, taken)])
+        assert axis.burst > 1
+        assert np.sqrt(np.mean((axis.t_s - taken) ** 2)) < within_s
 
 
 def test_a_long_gap_splits() -> None:

@@ -1199,8 +1199,8 @@ def _step_s(axis: TimeAxis, step_s: float, buffered: bool) -> float:
     are `buffered` steps do not part them, and what is unknown is how late in a period buffers are read.
     """
     if buffered:
-        lasts = np.append(np.diff(axis.stamps_s) > 0.5 * axis.period_s, True)
-        late = (axis.stamps_s - axis.t_s)[lasts] / axis.period_s
+        # Those of a burst before its last are whole periods older.
+        late = (axis.stamps_s - axis.t_s) / axis.period_s
         return axis.period_s * abs(complex(np.exp(2j * np.pi * late).mean()))
     if step_s > COARSE[1] * axis.period_s:
         return step_s

@@ -133,12 +133,11 @@ def rows_of(log: Log, found: Periods) -> Rows:
     camera, imu = _kinds(log, readings, found.ticks)
     kinds = camera.astype(np.int64) + 2 * imu.astype(np.int64)
     t = np.asarray(log.t_s, dtype=np.float64)
-    waited = np.zeros(len(t))
-    for rows, burst in ((camera, found.camera_burst), (imu, found.imu_burst)):
-        if burst > 1:
-            own = np.flatnonzero(rows)
-            for part in np.split(own, np.flatnonzero(np.diff(t[own]) < 0.0) + 1):
-                waited[part] = t[part] - time_axis(t[part]).t_s
+    buffered = [rows for rows, burst in ((camera, found.camera_burst), (imu, found.imu_burst)) if burst > 1]
+    waited = np.zeros(len(t) if buffered else 0)
+    for own in map(np.flatnonzero, buffered):
+        for part in np.split(own, np.flatnonzero(np.diff(t[own]) < 0.0) + 1):
+            waited[part] = t[part] - time_axis(t[part]).t_s
     return Rows(t, readings, kinds, waited)
 
 
