@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -33,9 +34,11 @@ from calib.stages.align.solve import (
     Problem,
     Stretch,
     _accelerations_at,
+    _beside,
     _centred,
     _from_axis,
     _leant,
+    _own,
     align,
     best_jitter_px,
     judge,
@@ -44,7 +47,6 @@ from calib.stages.align.solve import (
     pixel_terms,
     readings_off,
     repeating,
-    response,
     rest_angle,
     solve,
     start,
@@ -462,12 +464,9 @@ def test_sigma_tells_the_errors_of_rigs_that_differ() -> None:
     assert np.sqrt(np.mean(np.square(mount))) < math.radians(0.1)
 
 
-AREA = 1256.0
-
-
 def _terms(off: np.ndarray, jitter: float, grid: float, share: float) -> tuple[float, np.ndarray, np.ndarray]:
     pull, weight, good = np.empty(off.shape), np.empty(off.shape), np.empty(len(off))
-    loss = pixel_terms(off, jitter, grid, share, AREA, pull, weight, good)
+    loss = pixel_terms(off, jitter, grid, share, pull, weight, good)
     return loss, pull, good
 
 
@@ -492,7 +491,7 @@ def test_jitter_is_found_below_a_pixel(jitter: float) -> None:
     place = rng.uniform(0.0, 100.0, (20000, 2))
     seen = np.rint(place + jitter * rng.standard_normal(place.shape))
     seen[:60] += rng.uniform(5.0, 14.0, (60, 2))
-    assert best_jitter_px(seen - place, 1.0, 0.003, AREA) == pytest.approx(jitter, rel=0.03)
+    assert best_jitter_px(seen - place, 1.0, 0.003) == pytest.approx(jitter, rel=0.03)
 
 
 VIEW = nominal_view()
@@ -601,7 +600,7 @@ def test_the_response_is_that_of_changed_readings() -> None:
     fit = solve(problem, MEAN, NOISE)
     stretch = problem.stretches[0]
     change = np.array([0.0, 0.0, 1e-4])
-    predicted = response(problem, fit, 0, change)
+    *_, predicted = _beside(problem, fit, partial(_own, problem, fit, "gyro_bias_radps", -1e-4), [0])
     moved = replace(stretch, readings=stretch.readings - change, start=fit.coefficients[0])
     again = solve(replace(problem, stretches=(moved,)), fit.sensor, fit.noise)
     assert predicted[0] == pytest.approx(-1e-4, rel=0.02)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -67,8 +68,8 @@ _COARSE = 4
 
 @kernel()
 def pixel_terms(
-    off: FloatArray, jitter: float, grid: float, share: float, area: float, pull: FloatArray,
-    weight: FloatArray, good: FloatArray,
+    off: FloatArray, jitter: float, grid: float, share: float, pull: FloatArray, weight: FloatArray,
+    good: FloatArray,
 ) -> float:  # fmt: skip
     """Loss of pictures off by (n, 2) [px]; pull (n, 2), weight (n, 2) and w (n,) are written to.
 
@@ -76,7 +77,7 @@ def pixel_terms(
     for Z over one pixel.
     """
     loss = 0.0
-    back = share / area
+    back = share / _OUTLIER_AREA_PX2
     for n in range(len(off)):
         log_z = 0.0
         known = True
@@ -108,12 +109,12 @@ def pixel_terms(
     return loss
 
 
-def best_jitter_px(off: FloatArray, grid: float, share: float, area: float) -> float:
+def best_jitter_px(off: FloatArray, grid: float, share: float) -> float:
     """Jitter that makes pictures off by (n, 2) [px] most likely."""
     pull, weight, good = np.empty(off.shape), np.empty(off.shape), np.empty(len(off))
 
     def loss(k: int) -> float:
-        return pixel_terms(off, float(_JITTERS_PX[k]), grid, share, area, pull, weight, good)
+        return pixel_terms(off, float(_JITTERS_PX[k]), grid, share, pull, weight, good)
 
     last = len(_JITTERS_PX) - 1
     coarse = min(range(0, last + 1, _COARSE), key=loss)
@@ -291,41 +292,60 @@ def readings_off(stretch: Stretch, c: FloatArray, sensor: FloatArray) -> FloatAr
     return np.concatenate([off for off, _, _ in _readings(stretch, c, sensor)])
 
 
+class Terms(NamedTuple):
+    """What measurements of one kind add to the loss and to the normal equations, a chunk of them.
+
+    Attributes
+    ----------
+    pull, weight : (k, channels). good : (k,) probability that a picture shows the marker; (0,) of no picture.
+    """
+
+    rows: Rows
+    loss: float
+    pull: FloatArray
+    weight: FloatArray
+    good: FloatArray = np.empty(0)
+
+
 def _picture_terms(
-    problem: Problem, noise: Noise, off: FloatArray
-) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Loss, pull, weight and probability of pictures off by (k, 2) [px], as `pixel_terms` has them."""
-    room = np.empty_like(off), np.empty_like(off), np.empty(len(off))
-    return pixel_terms(off, noise.jitter_px, problem.grid_px, noise.share, _OUTLIER_AREA_PX2, *room), *room
+    problem: Problem, noise: Noise, stretch: Stretch, c: FloatArray, s: FloatArray
+) -> Iterator[Terms]:
+    for off, rows in _pictures(problem, stretch, c, s):
+        room = np.empty_like(off), np.empty_like(off), np.empty(len(off))
+        loss = pixel_terms(off, noise.jitter_px, problem.grid_px, noise.share, *room)
+        yield Terms(rows, loss, *room)
 
 
-def _accelerations(stretch: Stretch) -> Iterator[Rows]:
-    """Accelerations of phi and l in the middle of each span, a chunk at a time."""
+def _reading_terms(noise: Noise, stretch: Stretch, c: FloatArray, s: FloatArray) -> Iterator[Terms]:
+    for off, rows, part in _readings(stretch, c, s):
+        yield Terms(rows, *imu_terms(off, noise.of(stretch, part)))
+
+
+def _prior_terms(stretch: Stretch, c: FloatArray) -> Iterator[Terms]:
+    """Accelerations of phi and l in the middle of each span, of which zero is likely."""
     middles = stretch.knots.middles
     for part in chunks(len(middles)):
         span, basis = basis_rows(stretch.knots, middles[part])
-        by = np.zeros((len(span), 2, SIZE))
+        by, loose = np.zeros((len(span), 2, SIZE)), stretch.loose[part]
         by[:, 0, 4], by[:, 1, 5] = 1.0, 1.0
-        yield Rows(span, basis, np.zeros((len(span), 2)), by)
+        bend = np.einsum("nj,nja->na", basis[:, 2], c[span[:, None] + np.arange(6)])
+        z = bend / loose
+        yield Terms(Rows(span, basis, bend, by), 0.5 * float((z * z).sum()), -z / loose, 1.0 / loose**2)
 
 
-def _prior(stretch: Stretch, c: FloatArray) -> tuple[float, FloatArray]:
-    """Loss of a stretch's accelerations and anchor, and its pull on the accelerations (spans, 2)."""
-    bends = [
-        np.einsum("nj,nja->na", rows.basis[:, 2], c[rows.span[:, None] + np.arange(6)])
-        for rows in _accelerations(stretch)
-    ]
-    z, away = np.concatenate(bends) / stretch.loose, (c - stretch.start) / _ANCHOR
-    return 0.5 * float((z * z).sum() + (away * away).sum()), -z / stretch.loose
+def _terms(problem: Problem, noise: Noise, stretch: Stretch, c: FloatArray, s: FloatArray) -> Iterator[Terms]:
+    """All that the fit knows of a stretch, but for the anchor of its coefficients."""
+    yield from _picture_terms(problem, noise, stretch, c, s)
+    yield from _reading_terms(noise, stretch, c, s)
+    yield from _prior_terms(stretch, c)
 
 
 def _loss(problem: Problem, cs: list[FloatArray], s: FloatArray, noise: Noise) -> float:
     """Minus the logarithm of the posterior."""
     total = 0.5 * float((((s - problem.mean) / problem.sigma) ** 2).sum())
     for stretch, c in zip(problem.stretches, cs, strict=True):
-        total += sum(_picture_terms(problem, noise, off)[0] for off, _ in _pictures(problem, stretch, c, s))
-        total += sum(imu_terms(off, noise.of(stretch, part))[0] for off, _, part in _readings(stretch, c, s))
-        total += _prior(stretch, c)[0]
+        total += 0.5 * float((((c - stretch.start) / _ANCHOR) ** 2).sum())
+        total += sum(one.loss for one in _terms(problem, noise, stretch, c, s))
     return total
 
 
@@ -342,19 +362,10 @@ def _normal(
     for stretch, c in zip(problem.stretches, cs, strict=True):
         A, B, to_c = np.zeros((c.size, BAND)).T, np.zeros((c.size, len(s))), np.zeros(c.size)
         good = []
-        for off, rows in _pictures(problem, stretch, c, s):
-            _, pull, weight, likely = _picture_terms(problem, noise, off)
+        for rows, _, pull, weight, likely in _terms(problem, noise, stretch, c, s):
             normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
             gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
             good.append(likely)
-        for off, rows, part in _readings(stretch, c, s):
-            _, pull, weight = imu_terms(off, noise.of(stretch, part))
-            normal_sums(rows.span, rows.basis, rows.by, weight, A, B, C)
-            gathered(rows.span, rows.basis, rows.by, pull, to_c, to_s)
-        weight, pull = 1.0 / stretch.loose**2, _prior(stretch, c)[1]
-        for part, rows in zip(chunks(len(pull)), _accelerations(stretch), strict=True):
-            normal_sums(rows.span, rows.basis, rows.by, weight[part], A, B, C)
-            gathered(rows.span, rows.basis, rows.by, pull[part], to_c, to_s)
         A[0] += np.tile(1.0 / _ANCHOR**2, len(c))
         to_c += ((stretch.start - c) / _ANCHOR**2).ravel()
         # A turns into its factor where it is, and A^-1 B is never there as a whole.
@@ -922,7 +933,7 @@ def _renewed(
     good = np.concatenate(goods)
     share = float(np.clip(1.0 - good.mean() if len(good) else 0.0, 1e-3, 0.5))
     offs = [pictures_off(problem, stretch, c, s) for stretch, c in zip(problem.stretches, cs, strict=True)]
-    jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share, _OUTLIER_AREA_PX2)
+    jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share)
     imu, lost = _imu_noise(problem, arrow, cs, s, noise)
     return Noise(jitter, share, imu, _age_s(problem, cs, s, imu, lost))
 
@@ -1004,16 +1015,6 @@ def _followed(stretch: Stretch, c: FloatArray, fit: Fit) -> Stretch:
     return replace(stretch, start=c, missed=maximum_filter1d(off, 2 * near + 1, axis=0))
 
 
-def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArray:
-    """Change (14,) of the sensors' quantities when predictions of stretch i's IMU change by so much (3,)."""
-    stretch, c = problem.stretches[i], fit.coefficients[i]
-    to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
-    for off, rows, part in _readings(stretch, c, fit.sensor):
-        _, _, weight = imu_terms(off, fit.noise.of(stretch, part))
-        gathered(rows.span, rows.basis, rows.by, -weight * change, to_c, to_s)
-    return np.asarray(cho_solve(fit.arrow.S, to_s - fit.arrow.B[i].T @ fit.arrow.own(i, to_c)))
-
-
 # ----------------------------------------------------------------------
 # Camera and IMU of a moving rig brought into line: time offset, mount angle, scales, biases, marker.
 #
@@ -1039,10 +1040,11 @@ def response(problem: Problem, fit: Fit, i: int, change: FloatArray) -> FloatArr
 # what the accelerometer reads at phi = 0; it comes with its own deviation.
 
 _FIRST_NOISE = Noise(1.0, 0.05, np.array([0.2, 0.2, 0.01]))
-_AX, _AY, _MOUNT, _OFFSET, _MARKER = (
+_GZ, _AX, _AY, _MOUNT, _OFFSET, _MARKER = (
     SENSOR.index(name)
     for name in (
-        "accel_bias_x_mps2", "accel_bias_y_mps2", "mount_angle_rad", "time_offset_s", "marker_offset_m",
+        "gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2", "mount_angle_rad", "time_offset_s",
+        "marker_offset_m",
     )
 )  # fmt: skip
 _SX, _SY = SENSOR.index("accel_scale_x"), SENSOR.index("accel_scale_y")
@@ -1242,52 +1244,18 @@ def _pace(pieces: Sequence[Piece], offset_s: float) -> tuple[float, float]:
     return (float(sums[0] / sums[1]), float(sums[1] ** -0.5)) if sums[1] > 0.0 else (0.0, math.inf)
 
 
-def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
-    """Covariance (14, 14) from biases that differ from stretch to stretch."""
-    total = np.zeros((len(SENSOR), len(SENSOR)))
-    walks = np.diag([settings.accel_walk, settings.accel_walk, settings.gyro_walk])
-    for i, stretch in enumerate(problem.stretches):
-        duration = float(stretch.imu_s[-1] - stretch.imu_s[0])
-        for walk in walks:
-            moved = response(problem, fit, i, walk * math.sqrt(duration / 3.0))
-            total += np.outer(moved, moved)
-    return total
-
-
-def turned(problem: Problem, fit: Fit) -> FloatArray:
-    """Change (14,) of the quantities per radian by which the world's axes lie turned about its middle.
-
-    Turned axes look like a bent head: at rest the marker is as far aside, and only the curve of its path
-    differs. No quantity stands for them.
-    """
-    total = np.zeros(len(SENSOR))
-    for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
-        to_c, to_s = np.zeros(c.size), np.zeros(len(SENSOR))
-        for off, rows in _pictures(problem, stretch, c, fit.sensor):
-            _, _, weight, _ = _picture_terms(problem, fit.noise, off)
-            seen = (weight > 0.0).all(axis=1) & np.isfinite(rows.by).all(axis=(1, 2))
-            by = rows.by[seen]
-            # Stretching moves the marker away from the middle, turning across that.
-            by_place = by[:, :, _SHIFT]
-            away = np.linalg.solve(by_place, by[:, :, _STRETCH, None])
-            across = by_place @ (away[:, ::-1] * np.array([[-1.0], [1.0]]))
-            gathered(rows.span[seen], rows.basis[seen], by, -weight[seen] * across[:, :, 0], to_c, to_s)
-        total += cho_solve(fit.arrow.S, to_s - fit.arrow.B[i].T @ fit.arrow.own(i, to_c))
-    return total
-
-
 _SURELY_APART = 6.0
 _MAY_DIFFER = {
-    "accel_bias_x_mps2": 0.01,
-    "accel_bias_y_mps2": 0.01,
-    "gyro_bias_radps": 1e-3,
-    "mount_angle_rad": 1e-3,
-    "time_offset_s": 5e-4,
+    "accel_bias_x_mps2": (0.01, "by {:+.3f} m/s^2"),
+    "accel_bias_y_mps2": (0.01, "by {:+.3f} m/s^2"),
+    "gyro_bias_radps": (1e-3, "by {:+.4f} rad/s"),
+    "mount_angle_rad": (1e-3, "by {:+.4f} rad"),
+    "time_offset_s": (5e-4, "by {:+.4f} s"),
 }
-"""Deviations, and amounts, from which on a log has its own: 0.001 rad and 0.01 m/s^2 are 0.06 degrees, and
-logs that were joined to their camera's differ by up to 3 ms, of one clock by less than 2 deviations. Four
-logs of one rig come to 2.4 deviations at most, in 32 alignments of other plants, noise, rates and outliers;
-of stamps in steps of 10 ms to 8.9, for 9e-4 rad/s."""
+"""Deviations, and amounts with their words, from which on a log has its own: 0.001 rad and 0.01 m/s^2 are
+0.06 degrees, and logs that were joined to their camera's differ by up to 3 ms, of one clock by less than 2
+deviations. Four logs of one rig come to 2.4 deviations at most, in 32 alignments of other plants, noise,
+rates and outliers; of stamps in steps of 10 ms to 8.9, for 9e-4 rad/s."""
 _TOLD = 1e-3
 """Share of the information that is left beside other quantities, below which a log does not tell it."""
 
@@ -1315,23 +1283,23 @@ class Apart:
     moved: FloatArray
 
 
-Column = Iterator[tuple[Rows, FloatArray, FloatArray, FloatArray]]
-"""Rows, what one more quantity changes of their predictions, pull and weight, a chunk at a time."""
+Changes = Iterator[tuple[Terms, FloatArray]]
+"""Terms of a stretch, and what one more quantity changes of their predictions."""
+Column = Callable[[Stretch, FloatArray], Changes]
 
 
 def _beside(
-    problem: Problem, fit: Fit, column: Callable[[Stretch, FloatArray], Column], log: int
+    problem: Problem, fit: Fit, column: Column, of: Iterable[int]
 ) -> tuple[float, float, float, FloatArray]:
-    """Score of one more quantity of a log, or of all (-1), and information on it alone and beside all others.
+    """Score of one more quantity of these stretches, and information on it alone and beside all others.
 
     Last, by how much one unit of it moves these (14,).
     """
     right, score, alone, taken = np.zeros(len(SENSOR)), 0.0, 0.0, 0.0
-    for i, (stretch, c) in enumerate(zip(problem.stretches, fit.coefficients, strict=True)):
-        if log not in (-1, stretch.log):
-            continue
+    for i in of:
+        c = fit.coefficients[i]
         to_c = np.zeros(c.size)
-        for rows, change, pull, weight in column(stretch, c):
+        for (rows, _, pull, weight, _), change in column(problem.stretches[i], c):
             score += float((pull * change).sum())
             alone += float((weight * change**2).sum())
             gathered(rows.span, rows.basis, rows.by, weight * change, to_c, right)
@@ -1342,11 +1310,10 @@ def _beside(
     return score, alone, alone - taken - float(right @ moved), moved
 
 
-def _one_more(
-    problem: Problem, fit: Fit, column: Callable[[Stretch, FloatArray], Column], log: int, name: str
-) -> Apart | None:
+def _one_more(problem: Problem, fit: Fit, column: Column, log: int, name: str) -> Apart | None:
     """One more quantity of a log, or of all (-1), as far as the readings tell it beside all others."""
-    score, alone, known, moved = _beside(problem, fit, column, log)
+    of = [i for i, stretch in enumerate(problem.stretches) if log in (-1, stretch.log)]
+    score, alone, known, moved = _beside(problem, fit, column, of)
     if known <= _TOLD * alone:
         return None
     away = score / known
@@ -1357,26 +1324,54 @@ def _apart(problem: Problem, fit: Fit, logs: int) -> list[Apart]:
     """Logs with quantities of their own, of which a single one has none; an accelerometer that is late."""
     out = [_one_more(problem, fit, partial(_late, fit), -1, _LATE)]
     for log, name in product(range(logs if logs > 1 else 0), _MAY_DIFFER):
-        out.append(_one_more(problem, fit, partial(_own, problem, fit, name), log, name))
-    least = _MAY_DIFFER | {_LATE: _LATE_S[0]}
+        out.append(_one_more(problem, fit, partial(_own, problem, fit, name, 1.0), log, name))
+    least = {name: amount for name, (amount, _) in _MAY_DIFFER.items()} | {_LATE: _LATE_S[0]}
     return [
         one for one in out
         if one is not None and one.deviations > _SURELY_APART and abs(one.away) > least[one.name]
     ]  # fmt: skip
 
 
-def _own(problem: Problem, fit: Fit, name: str, stretch: Stretch, c: FloatArray) -> Column:
-    """What a quantity changes: pictures or the IMU's readings."""
-    at = 6 + SENSOR.index(name)
+def _own(problem: Problem, fit: Fit, name: str, size: float, stretch: Stretch, c: FloatArray) -> Changes:
+    """What so much of a quantity changes: pictures or the IMU's readings."""
+    at = len(HEAD) + SENSOR.index(name)
     if name == SENSOR[_OFFSET]:
-        for off, rows in _pictures(problem, stretch, c, fit.sensor):
-            _, pull, weight, _ = _picture_terms(problem, fit.noise, off)
+        for one in _picture_terms(problem, fit.noise, stretch, c, fit.sensor):
             # A place that no picture shows has no derivative.
-            yield rows, np.where(weight > 0.0, rows.by[:, :, at], 0.0), pull, weight
+            yield one, size * np.where(one.weight > 0.0, one.rows.by[:, :, at], 0.0)
         return
-    for off, rows, part in _readings(stretch, c, fit.sensor):
-        _, pull, weight = imu_terms(off, fit.noise.of(stretch, part))
-        yield rows, rows.by[:, :, at], pull, weight
+    for one in _reading_terms(fit.noise, stretch, c, fit.sensor):
+        yield one, size * one.rows.by[:, :, at]
+
+
+def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
+    """Covariance (14, 14) from biases that differ from stretch to stretch."""
+    total = np.zeros((len(SENSOR), len(SENSOR)))
+    for i, stretch in enumerate(problem.stretches):
+        root = math.sqrt(float(stretch.imu_s[-1] - stretch.imu_s[0]) / 3.0)
+        for at, walk in ((_AX, settings.accel_walk), (_AY, settings.accel_walk), (_GZ, settings.gyro_walk)):
+            moved = _beside(problem, fit, partial(_own, problem, fit, SENSOR[at], walk * root), [i])[3]
+            total += np.outer(moved, moved)
+    return total
+
+
+def turned(problem: Problem, fit: Fit) -> FloatArray:
+    """Change (14,) of the quantities per radian by which the world's axes lie turned about its middle.
+
+    Turned axes look like a bent head: at rest the marker is as far aside, and only the curve of its path
+    differs. No quantity stands for them.
+    """
+
+    def across(stretch: Stretch, c: FloatArray) -> Changes:
+        for one in _picture_terms(problem, fit.noise, stretch, c, fit.sensor):
+            seen = (one.weight > 0.0).all(axis=1) & np.isfinite(one.rows.by).all(axis=(1, 2))
+            by, change = one.rows.by[seen], np.zeros_like(one.pull)
+            # Stretching moves the marker away from the middle, turning across that.
+            away = np.linalg.solve(by[:, :, _SHIFT], by[:, :, _STRETCH, None])
+            change[seen] = (by[:, :, _SHIFT] @ (away[:, ::-1] * np.array([[1.0], [-1.0]])))[:, :, 0]
+            yield one, change
+
+    return _beside(problem, fit, across, range(len(problem.stretches)))[3]
 
 
 def _accelerations_at(stretch: Stretch, late_s: float) -> Stretch:
@@ -1393,35 +1388,36 @@ def _accelerations_at(stretch: Stretch, late_s: float) -> Stretch:
     return replace(stretch, readings=readings)
 
 
-def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
+def _late(fit: Fit, stretch: Stretch, c: FloatArray) -> Changes:
     """What accelerations that are late beside the rates change of the IMU's readings."""
-    for part in chunks(len(stretch.imu_s)):
-        t = stretch.imu_s[part]
-        before, rows, after = (
-            imu_rows(stretch.knots, c, fit.sensor, t + step) for step in (-_DIFFERENCE_S, 0.0, _DIFFERENCE_S)
+    terms = _reading_terms(fit.noise, stretch, c, fit.sensor)
+    for one, part in zip(terms, chunks(len(stretch.imu_s)), strict=True):
+        before, after = (
+            imu_rows(stretch.knots, c, fit.sensor, stretch.imu_s[part] + step).predicted
+            for step in (-_DIFFERENCE_S, _DIFFERENCE_S)
         )
-        change = (before.predicted - after.predicted) / (2.0 * _DIFFERENCE_S)
+        change = (before - after) / (2.0 * _DIFFERENCE_S)
         change[:, 2] = 0.0
-        _, pull, weight = imu_terms(stretch.readings[part] - rows.predicted, fit.noise.of(stretch, part))
-        yield rows, change, pull, weight
+        yield one, change
 
 
-def _turned_motion(fit: Fit, stretch: Stretch, c: FloatArray) -> Column:
+def _turned_motion(fit: Fit, stretch: Stretch, c: FloatArray) -> Changes:
     """Change of what the accelerometer reads of the motion, by the angle at which gravity stands aside."""
     s = fit.sensor
-    for off, rows, part in _readings(stretch, c, s):
+    for one in _reading_terms(fit.noise, stretch, c, s):
+        rows = one.rows
         phi = np.einsum("nj,nj->n", rows.basis[:, 0], c[rows.span[:, None] + np.arange(6), 0])
         # As by the mount angle, which turns gravity too.
         change = rows.by[:, :, len(HEAD) + _MOUNT].copy()
         change[:, 0] += (1.0 + s[_SX]) * GRAVITY_MPS2 * np.sin(phi + s[_MOUNT])
         change[:, 1] -= (1.0 + s[_SY]) * GRAVITY_MPS2 * np.cos(phi + s[_MOUNT])
-        _, pull, weight = imu_terms(off, fit.noise.of(stretch, part))
-        yield rows, change, pull, weight
+        yield one, change
 
 
 def _leant(problem: Problem, fit: Fit) -> FloatArray:
     """Covariance (14, 14) by gravity that stands aside of the world's y axis, at what angle is likely."""
-    score, _, known, moved = _beside(problem, fit, partial(_turned_motion, fit), -1)
+    every = range(len(problem.stretches))
+    score, _, known, moved = _beside(problem, fit, partial(_turned_motion, fit), every)
     variance = 1.0 / (max(known, 0.0) + _LEAN_RAD**-2)
     return (variance + (score * variance) ** 2) * np.outer(moved, moved)
 
@@ -1728,13 +1724,6 @@ def _contradicted(found: Alignment) -> Iterator[Finding]:
         )
 
 
-_DIFFERS = {
-    "accel_bias_x_mps2": "by {:+.3f} m/s^2",
-    "accel_bias_y_mps2": "by {:+.3f} m/s^2",
-    "gyro_bias_radps": "by {:+.4f} rad/s",
-    "mount_angle_rad": "by {:+.4f} rad",
-    "time_offset_s": "by {:+.4f} s",
-}
 _MOUNTED = "was the IMU or the camera moved between the logs, or the IMU warmer? align this log alone"
 _JOINED = "were camera and IMU joined log by log? where their clocks went on, join all with one --offset"
 
@@ -1752,7 +1741,7 @@ def _differing(found: Alignment) -> Iterator[Finding]:
             yield Finding(
                 "remark",
                 f"{found.logs[most.log].name}: {QUANTITIES[most.name].words} differs from that in the other "
-                f"logs {_DIFFERS[most.name].format(most.away)}; the deviations hold this",
+                f"logs {_MAY_DIFFER[most.name][1].format(most.away)}; the deviations hold this",
                 advice,
             )
 
