@@ -56,13 +56,8 @@ def driven_log(name: str, seed: int = 0, orifice: bool = False) -> tuple[Simulat
     return rig, log_of(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
 
 
-def commands_of(log: Log) -> FloatArray:
-    """Commands (n, 2) of a log."""
-    return np.stack([log.columns["pwm1"], log.columns["pwm2"]], axis=1)
-
-
-def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray, FloatArray]:
-    """A rig whose head is held at 0.5 rad and let go at a time: rows, commands (n, 2), true q1, q2, phi."""
+def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray]:
+    """A rig whose head is held at 0.5 rad and let go at a time: rows, true q1, q2, phi."""
     rig, log = driven_log("swing", seed)
     rows, true, rng = rows_from(log), truth(log), np.random.default_rng(seed)
     state, spare = np.zeros(SIZE), (np.empty(SIZE), np.empty(SIZE))
@@ -78,26 +73,18 @@ def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray, 
     t, kinds = np.concatenate([camera_s, imu_s]), np.repeat([1, 2], [len(camera_s), len(imu_s)])
     order = np.argsort(t, kind="stable")
     pwm = np.where(kinds[order, None] == 1, 0.0, np.nan) * np.ones(2)
-    whole = Rows(
-        np.concatenate([t[order], rows.t_s + held_s]),
-        np.concatenate([readings[order], rows.readings]),
-        np.concatenate([kinds[order], rows.kinds]),
-    )
-    return (
-        rig,
-        whole,
-        np.concatenate([pwm, commands_of(log)]),
-        np.concatenate([np.tile(true[0], (len(t), 1)), true]),
-    )
+    held = Rows(t[order], readings[order], kinds[order], pwm=pwm)
+    whole = Rows.joined([held, replace(rows, t_s=rows.t_s + held_s)])
+    return rig, whole, np.concatenate([np.tile(true[0], (len(t), 1)), true])
 
 
-def hostile(seed: int, rows: Rows, pwm: FloatArray) -> tuple[Rows, FloatArray]:
+def hostile(seed: int, rows: Rows) -> Rows:
     """A short piece of a log (120 to 300 rows) on which up to four things go wrong at random."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(120, 301))
     at = int(rng.integers(0, max(len(rows) - n, 1)))
-    t, z, kinds = (part[at : at + n].copy() for part in (rows.t_s, rows.readings, rows.kinds))
-    pwm = pwm[at : at + n].copy()
+    part = rows[at : at + n]
+    t, z, kinds, pwm = (of.copy() for of in (part.t_s, part.readings, part.kinds, part.pwm))
     n = len(t)
     for fault in rng.choice(8, int(rng.integers(1, 5)), replace=False):
         begin, end = np.sort(rng.integers(0, n + 1, 2))
@@ -118,7 +105,7 @@ def hostile(seed: int, rows: Rows, pwm: FloatArray) -> tuple[Rows, FloatArray]:
         elif end > begin:
             z[some] = np.where(np.isfinite(z[some]), z[begin], np.nan)
     seen, felt = np.isfinite(z[:, :2]).all(axis=1), np.isfinite(z[:, 2:]).any(axis=1)
-    return Rows(t, z, np.where(seen, kinds & 1, 0) + np.where(felt, kinds & 2, 0)), pwm
+    return Rows(t, z, np.where(seen, kinds & 1, 0) + np.where(felt, kinds & 2, 0), pwm=pwm)
 
 
 def unsound(out: FloatArray) -> str:

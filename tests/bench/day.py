@@ -36,7 +36,7 @@ from calib.io.tables import GENERAL, TIME, table_bytes
 from calib.stages.estimator.consistency import Tally
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import rows_of, truth_of
-from calib.stages.estimator.replay import Estimate, drive_for, opened
+from calib.stages.estimator.replay import drive_for, estimator_for, opened
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
@@ -137,12 +137,12 @@ def _stages(
     rig = Rig.load(rig_path)
     log = opened(path, rig, rig_path)
     setup, found = log.setup, log.periods
-    estimate = Estimate(setup, drive_for(log, rig, model), model)
+    estimate = estimator_for(setup, drive_for(log, rig, model), model)
     blocks = list(islice(iter_log(path), count))
     n = sum(len(block) for block in blocks)
     show(f"read {path.suffix}", n, lambda: list(islice(iter_log(path), count)))
     rows = show("rows for the filter", n, lambda: [rows_of(block, found) for block in blocks])
-    outs = show("filter", n, lambda: [estimate(r, b) for r, b in zip(rows, blocks, strict=True)])
+    outs = show("filter", n, lambda: [estimate.run(one) for one in rows])
     tally = Tally(setup.bellows_radius_m)
     truths = [truth_of(block) for block in blocks]
     show("consistency", n, lambda: [tally.add(o, t) for o, t in zip(outs, truths, strict=True)])

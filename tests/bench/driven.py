@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
-from drivenlogs import commands_of, driven_log
+from drivenlogs import driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
 
 from calib.core.arrays import FloatArray
@@ -42,15 +42,15 @@ def _error(out: FloatArray, log: Log, setup: Setup) -> tuple[float, float, float
 
 def _speed() -> None:
     rig, log = driven_log("ellipse", 1)
-    setup, rows, pwm = setup_for(rig, 1), rows_from(log), commands_of(log)
+    setup, rows = setup_for(rig, 1), rows_from(log)
     best, smoothed = math.inf, math.inf
     for _ in range(4):
         driven = DrivenFilter(setup, FULL)
         began = time.process_time()
-        out = driven.run(rows, pwm)
+        out = driven.run(rows)
         best = min(best, time.process_time() - began)
         began = time.process_time()
-        smooth_driven(setup, FULL, rows, pwm, out)
+        smooth_driven(setup, FULL, rows, out)
         smoothed = min(smoothed, time.process_time() - began)
     span = float(log.t_s[-1])
     print(f"driven filter: {best / len(rows) * 1e6:.1f} us per row, {span / best:.0f} times real time")
@@ -84,22 +84,22 @@ def main() -> None:
     for name in SCENARIOS:
         for seed in seeds:
             rig, log = driven_log(name, seed)
-            setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
-            driven, kinematic, weight = Handover(setup, FULL).run_each(rows, pwm)
+            setup, rows = setup_for(rig, seed), rows_from(log)
+            driven, kinematic, weight = Handover(setup, FULL).run_each(rows)
             outs = {
                 "kinematic": kinematic,
                 "driven": driven,
                 "with handover": blended(driven, kinematic, weight),
-                "driven, smoothed": smooth_driven(setup, FULL, rows, pwm, driven),
-                "both, smoothed": smooth_both(setup, FULL, rows, pwm, driven, kinematic),
+                "driven, smoothed": smooth_driven(setup, FULL, rows, driven),
+                "both, smoothed": smooth_both(setup, FULL, rows, driven, kinematic),
             }
             if ablation:
                 outs |= {
-                    "no rounding likelihood": DrivenFilter(_without_rounding(setup), FULL).run(rows, pwm),
-                    "no clock": DrivenFilter(_without_clock(setup), FULL).run(rows, pwm),
-                    "no parameter states": DrivenFilter(setup, KNOWN).run(rows, pwm),
-                    "no creep": DrivenFilter(setup, NO_CREEP).run(rows, pwm),
-                    "no disturbance states": DrivenFilter(setup, NO_DISTURBANCE).run(rows, pwm),
+                    "no rounding likelihood": DrivenFilter(_without_rounding(setup), FULL).run(rows),
+                    "no clock": DrivenFilter(_without_clock(setup), FULL).run(rows),
+                    "no parameter states": DrivenFilter(setup, KNOWN).run(rows),
+                    "no creep": DrivenFilter(setup, NO_CREEP).run(rows),
+                    "no disturbance states": DrivenFilter(setup, NO_DISTURBANCE).run(rows),
                 }
             for label, out in outs.items():
                 columns = table.setdefault(label, [[] for _ in SCENARIOS])

@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
-from drivenlogs import commands_of, hostile, unsound
+from drivenlogs import hostile, unsound
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated
 
 from calib.stages.estimator.driven import Drive, Handover, blended, smooth_both
@@ -29,18 +29,18 @@ def main(count: int, first: int) -> int:
     sources = []
     for name in SCENARIOS:
         rig, log = simulated(name, 1)
-        sources.append((name, setup_for(rig, 1), rows_from(log), commands_of(log)))
+        sources.append((name, setup_for(rig, 1), rows_from(log)))
     broken, fastest, began = 0, 0.0, time.process_time()
     for seed in range(first, first + count):
-        name, setup, rows, pwm = sources[seed % len(sources)]
-        rows, pwm = hostile(seed, rows, pwm)
+        name, setup, rows = sources[seed % len(sources)]
+        rows = hostile(seed, rows)
         drive = Drive()
         try:
-            driven, kinematic, weight = Handover(setup, drive).run_each(rows, pwm)
+            driven, kinematic, weight = Handover(setup, drive).run_each(rows)
             out = blended(driven, kinematic, weight)
             parts = {"filter": out, "kinematic": kinematic, "driven": driven}
             if seed % 10 == 0:
-                parts["smoother"] = smooth_both(setup, drive, rows, pwm, driven, kinematic)
+                parts["smoother"] = smooth_both(setup, drive, rows, driven, kinematic)
             faults = {what: unsound(part) for what, part in parts.items()}
             fastest = max(fastest, float(np.nanmax(np.abs(out[:, 3:5]))))
         except (ArithmeticError, ValueError, IndexError) as error:

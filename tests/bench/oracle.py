@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
-from drivenlogs import commands_of, driven_log
+from drivenlogs import driven_log
 from estimatorlogs import SCENARIOS, SIGMA, rows_from, setup_for, truth, truth_of_sensors
 
 from calib.core.arrays import FloatArray
@@ -124,11 +124,11 @@ def main() -> None:
             for seed in range(first, first + count):
                 rig, log = driven_log(scenario, seed)
                 setup, drive = variant(name, setup_for(rig, seed), rig)
-                readings, pwm, true = rows_from(log), commands_of(log), truth(log)
-                driven, kinematic, weight = Handover(setup, drive).run_each(readings, pwm)
+                readings, true = rows_from(log), truth(log)
+                driven, kinematic, weight = Handover(setup, drive).run_each(readings)
                 radius = setup.bellows_radius_m
                 found["filter"].append(scores(blended(driven, kinematic, weight), true, radius))
-                smoothed = smooth_both(setup, drive, readings, pwm, driven, kinematic)
+                smoothed = smooth_both(setup, drive, readings, driven, kinematic)
                 found["smooth"].append(scores(smoothed, true, radius))
             for way, all_scores in found.items():
                 mm, degrees, nees, _ = np.mean(all_scores, axis=0)

@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import numpy as np
-from drivenlogs import commands_of, varied_drive
+from drivenlogs import varied_drive
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
 
 from calib.core.arrays import FloatArray
@@ -75,10 +75,10 @@ def main() -> None:
             found, shares = [], []
             for seed in range(first, first + count):
                 rig, log = made(kind, name, seed)
-                setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
-                driven, kinematic, weight = Handover(setup, Drive()).run_each(rows, pwm)
+                setup, rows = setup_for(rig, seed), rows_from(log)
+                driven, kinematic, weight = Handover(setup, Drive()).run_each(rows)
                 both = blended(driven, kinematic, weight)
-                smoothed = smooth_both(setup, Drive(), rows, pwm, driven, kinematic)
+                smoothed = smooth_both(setup, Drive(), rows, driven, kinematic)
                 errors = []
                 for out in (kinematic, driven, both, smoothed):
                     tally = Tally(setup.bellows_radius_m)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drivenlogs import commands_of, driven_log, held_log, hostile, unsound, varied_drive
+from drivenlogs import driven_log, held_log, hostile, unsound, varied_drive
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth
 from identifytrials import rig_file
 
@@ -51,7 +51,7 @@ from calib.stages.estimator.driven import (
     weigh,
 )
 from calib.stages.estimator.kinematic import OUT, Filter, Rows, Setup
-from calib.stages.estimator.noise import WALKS, driven_likelihood, scaled, tune_driven
+from calib.stages.estimator.noise import WALKS, log_likelihood, scaled, tune_driven
 from calib.stages.estimator.read import drive_from_rig, periods
 from calib.stages.estimator.smoother import smooth
 from calib.stages.estimator.tuning import tuned_section
@@ -70,7 +70,7 @@ def test_it_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
         rig, log = driven_log(name, seed)
         setup = setup_for(rig, seed)
         tally = Tally(setup.bellows_radius_m)
-        tally.add(DrivenFilter(setup, Drive()).run(rows_from(log), commands_of(log)), truth(log))
+        tally.add(DrivenFilter(setup, Drive()).run(rows_from(log)), truth(log))
         found = tally.rmse()
         figures.append((found["mean_q_mm"], found["phi_deg"], found["nees"]))
     mm, degrees, nees = np.mean(figures, axis=0)
@@ -82,7 +82,7 @@ def test_it_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
 def test_parameters_move_towards_the_truth() -> None:
     rig, log = driven_log("ellipse", 3)
     driven = DrivenFilter(setup_for(rig, 3), Drive())
-    driven.run(rows_from(log), commands_of(log))
+    driven.run(rows_from(log))
     x, P = driven.state
     sigma = np.sqrt(np.diag(P))
     # The lag and the falling rate stand alone; stiffness and strength only show in their ratio.
@@ -101,7 +101,7 @@ def test_readings_of_an_imu_that_come_late_are_put_at_their_moments(late_s: floa
     rows, true = rows_from(log), truth(log)[:, 2]
     stamps = np.where(rows.kinds == 2, rows.t_s + late_s, rows.t_s)
     order = np.argsort(stamps, kind="stable")
-    late, pwm = Rows(stamps[order], rows.readings[order], rows.kinds[order]), commands_of(log)[order]
+    late = replace(rows, t_s=stamps)[order]
     phi = np.interp(late.t_s, rows.t_s, true)
     setup = replace(setup_for(rig, 3), imu_delay_s=late_s)
 
@@ -109,7 +109,7 @@ def test_readings_of_an_imu_that_come_late_are_put_at_their_moments(late_s: floa
         some = (late.t_s > 0.5) & (late.t_s < late.t_s[-1] - 0.1)
         return float(np.degrees(np.std(out[some, OUT.index("phi_rad")] - phi[some])))
 
-    filtered, driven = Filter(setup).run(late), DrivenFilter(setup, Drive()).run(late, pwm)
+    filtered, driven = Filter(setup).run(late), DrivenFilter(setup, Drive()).run(late)
     told = [off_deg(out) for out in (filtered, driven, smooth(setup, late, filtered))]
     untold = off_deg(Filter(replace(setup, imu_delay_s=0.0)).run(late))
     assert max(told) < 0.15 * untold
@@ -117,13 +117,13 @@ def test_readings_of_an_imu_that_come_late_are_put_at_their_moments(late_s: floa
 
 def test_blocks_make_no_difference_and_the_future_has_no_say() -> None:
     rig, log = driven_log("elongation", 1)
-    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
-    whole = DrivenFilter(setup, Drive()).run(rows, pwm)
+    rows, setup = rows_from(log), setup_for(rig, 1)
+    whole = DrivenFilter(setup, Drive()).run(rows)
     blocks = DrivenFilter(setup, Drive())
     cut = [0, 1, 300, 301, 900, len(rows)]
-    parts = [blocks.run(rows[a:b], pwm[a:b]) for a, b in pairwise(cut)]
+    parts = [blocks.run(rows[a:b]) for a, b in pairwise(cut)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
-    head = DrivenFilter(setup, Drive()).run(rows[:700], pwm[:700])
+    head = DrivenFilter(setup, Drive()).run(rows[:700])
     np.testing.assert_array_equal(head, whole[:700])
     _, P = blocks.state
     np.testing.assert_array_equal(P, P.T)
@@ -134,13 +134,10 @@ def test_blocks_make_no_difference_and_the_future_has_no_say() -> None:
 def test_a_head_that_is_held_and_let_go_is_found_again() -> None:
     """The motion of the first half does not follow from any command: the filter starts again."""
     rig, log = driven_log("swing", 2)
-    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 2)
-    held = Rows(
-        np.concatenate([np.arange(200) * 0.01 - 2.01, rows.t_s]),
-        np.concatenate([np.tile([np.nan, np.nan, 9.0, 4.9, 0.0], (200, 1)), rows.readings]),
-        np.concatenate([np.full(200, 2), rows.kinds]),
-    )
-    out = DrivenFilter(setup, Drive()).run(held, np.concatenate([np.full((200, 2), np.nan), pwm]))[200:]
+    rows, setup = rows_from(log), setup_for(rig, 2)
+    readings, t_s = np.tile([np.nan, np.nan, 9.0, 4.9, 0.0], (200, 1)), np.arange(200) * 0.01 - 2.01
+    held = Rows(t_s, readings, np.full(200, 2), pwm=np.full((200, 2), np.nan))
+    out = DrivenFilter(setup, Drive()).run(Rows.joined([held, rows]))[200:]
     late = log.t_s > 2.0
     error = 1e3 * (out[late, 1] - truth(log)[late, 0])
     assert np.sqrt(np.mean(error**2)) < 0.3
@@ -153,10 +150,10 @@ def _rms_deg(out: FloatArray, true: FloatArray, some: BoolArray) -> float:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_head_that_is_let_go_is_followed_from_there(seed: int) -> None:
     """The gyroscope moves most where the model has nothing that moves it."""
-    rig, rows, pwm, true = held_log(seed, 3.0)
+    rig, rows, true = held_log(seed, 3.0)
     setup = setup_for(rig, seed)
-    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    filtered = DrivenFilter(setup, Drive()).run(rows)
+    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
     held, first = (rows.t_s > 1.0) & (rows.t_s < 3.0), (rows.t_s > 3.03) & (rows.t_s < 4.0)
     for out in (filtered, smoothed):
         assert _rms_deg(out, true, held) < 0.15
@@ -169,12 +166,12 @@ def test_a_head_that_is_let_go_is_followed_from_there(seed: int) -> None:
 
 def test_two_wrong_samples_of_the_gyroscope_are_no_hand() -> None:
     rig, log = driven_log("ellipse", 1)
-    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
+    rows, setup = rows_from(log), setup_for(rig, 1)
     readings = rows.readings.copy()
     wrong = np.nonzero((rows.kinds == 2) & (rows.t_s > 5.0))[0][:2]
     readings[wrong, 2:] += np.array([[3.0, -2.0, 4.0], [-2.0, 4.0, 3.0]])
-    plain = DrivenFilter(setup, Drive()).run(rows, pwm)
-    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings), pwm)
+    plain = DrivenFilter(setup, Drive()).run(rows)
+    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings))
     assert (out[wrong, OUT.index("gated_gyro")] == 1.0).all()
     np.testing.assert_allclose(out[:, 1:3], plain[:, 1:3], atol=5e-5)
     np.testing.assert_allclose(out[:, 5], plain[:, 5], atol=2e-3)
@@ -209,7 +206,7 @@ def test_a_start_at_an_outlier_does_not_lock_it_out() -> None:
     readings = rows.readings.copy()
     first = np.nonzero((rows.kinds == 1) & (rows.t_s > 0.05))[0][:3]
     readings[first, :2] += 15.0
-    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings), commands_of(log))
+    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings))
     late = rows.t_s > 2.0
     assert np.sqrt(np.mean((out[late, 1] - truth(log)[late, 0]) ** 2)) < 2e-4
 
@@ -217,7 +214,7 @@ def test_a_start_at_an_outlier_does_not_lock_it_out() -> None:
 @pytest.mark.parametrize("what", ["nan", "jump", "outliers", "backwards", "no_commands"])
 def test_no_input_makes_it_say_nan(what: str) -> None:
     rig, log = driven_log("step", 1)
-    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
+    rows, setup = rows_from(log), setup_for(rig, 1)
     readings, t = rows.readings.copy(), rows.t_s.copy()
     rng = np.random.default_rng(1)
     if what == "nan":
@@ -229,8 +226,8 @@ def test_no_input_makes_it_say_nan(what: str) -> None:
     elif what == "backwards":
         t[800:] = t[:800][-1] - np.arange(len(t) - 800) * 0.01
     else:
-        pwm[:] = np.nan
-    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings, t_s=t), pwm)
+        rows.pwm[:] = np.nan
+    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings, t_s=t))
     assert np.isfinite(out[:, :13]).all()
     assert (out[:, 10:13] > 0.0).all()
     if what in ("jump", "backwards"):
@@ -244,7 +241,7 @@ def test_a_head_at_rest_teaches_nothing_of_what_multiplies_its_motion() -> None:
         setup = setup_for(rig, seed)
         driven = DrivenFilter(setup, Drive())
         begin, _ = Drive().start(setup)
-        out = driven.run(rows_from(log), commands_of(log))
+        out = driven.run(rows_from(log))
         x, _ = driven.state
         away = np.abs(x - begin)[DYNAMIC:INVOLVED] / np.array(Drive().sigma)
         assert np.delete(away, PARAMETER.index("rest_length_m")).max() < 0.1
@@ -256,17 +253,17 @@ def test_a_head_at_rest_teaches_nothing_of_what_multiplies_its_motion() -> None:
 def test_a_plant_far_from_the_truth_gives_no_rates_that_no_rig_has(name: str) -> None:
     rig, log = driven_log(name, 3)
     drive = Drive(plant=replace(pumps_connected(), damping_scale=60.0))
-    out = DrivenFilter(setup_for(rig, 3), drive).run(rows_from(log), commands_of(log))
+    out = DrivenFilter(setup_for(rig, 3), drive).run(rows_from(log))
     assert np.nanmax(np.abs(out[:, 3:5])) < 1.0
 
 
 def test_commands_carry_it_through_four_seconds_without_readings() -> None:
     rig, log = driven_log("step", 1)
-    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
+    rows, setup = rows_from(log), setup_for(rig, 1)
     readings = rows.readings.copy()
     silent = (log.t_s > 4.0) & (log.t_s < 8.0)
     readings[silent] = np.nan
-    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings), pwm)
+    out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings))
     assert np.abs(out[silent, 1] - truth(log)[silent, 0]).max() < 3e-4
 
 
@@ -280,12 +277,12 @@ def test_commands_that_are_missing_cost_little_and_are_paid_for(name: str) -> No
     figures = []
     for seed in (1, 2, 3):
         rig, log = driven_log(name, seed)
-        rows, pwm = rows_from(log), commands_of(log)
-        pwm[np.random.default_rng(seed).random(len(pwm)) < 0.05] = np.nan
+        rows = rows_from(log)
+        rows.pwm[np.random.default_rng(seed).random(len(rows)) < 0.05] = np.nan
         setup = setup_for(rig, seed)
         assert periods(log).command_s == pytest.approx(setup.command_period_s, rel=0.02)
-        filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-        for out in (filtered, smooth_driven(setup, Drive(), rows, pwm, filtered)):
+        filtered = DrivenFilter(setup, Drive()).run(rows)
+        for out in (filtered, smooth_driven(setup, Drive(), rows, filtered)):
             tally = Tally(setup.bellows_radius_m)
             tally.add(out, truth(log))
             figures.append((tally.rmse()["mean_q_mm"], 0.5 * tally.rmse()["nees"]))
@@ -297,7 +294,7 @@ def test_commands_that_are_missing_cost_little_and_are_paid_for(name: str) -> No
 def test_the_right_model_speaks_throughout() -> None:
     for name in ("ellipse", "elongation"):
         rig, log = driven_log(name, 21)
-        out = Handover(setup_for(rig, 21), Drive()).run(rows_from(log), commands_of(log))
+        out = Handover(setup_for(rig, 21), Drive()).run(rows_from(log))
         late = log.t_s > 2.0
         assert (out[late, WEIGHT] > 0.5).mean() > 0.9
         assert np.isfinite(out[:, :13]).all()
@@ -310,7 +307,7 @@ def test_another_law_of_deflation_does_little_harm() -> None:
     for seed in (21, 22, 23):
         rig, log = driven_log("step", seed, orifice=True)
         setup = setup_for(rig, seed)
-        driven, kinematic, weight = Handover(setup, Drive()).run_each(rows_from(log), commands_of(log))
+        driven, kinematic, weight = Handover(setup, Drive()).run_each(rows_from(log))
         tally = Tally(setup.bellows_radius_m)
         tally.add(blended(driven, kinematic, weight), truth(log))
         worst.append(tally.rmse()["mean_q_mm"])
@@ -320,9 +317,9 @@ def test_another_law_of_deflation_does_little_harm() -> None:
 
 def test_smoothing_of_both_is_finite_and_better_than_the_filter() -> None:
     rig, log = driven_log("elongation", 22)
-    setup, rows, pwm = setup_for(rig, 22), rows_from(log), commands_of(log)
-    driven, kinematic, weight = Handover(setup, Drive()).run_each(rows, pwm)
-    smoothed = smooth_both(setup, Drive(), rows, pwm, driven, kinematic)
+    setup, rows = setup_for(rig, 22), rows_from(log)
+    driven, kinematic, weight = Handover(setup, Drive()).run_each(rows)
+    smoothed = smooth_both(setup, Drive(), rows, driven, kinematic)
     assert np.isfinite(smoothed[:, :13]).all()
     before, after = Tally(setup.bellows_radius_m), Tally(setup.bellows_radius_m)
     before.add(blended(driven, kinematic, weight), truth(log))
@@ -340,10 +337,10 @@ def test_smoothing_reaches_its_accuracy_on_rigs_that_differ(name: str) -> None:
     figures = []
     for seed in range(21, 29):
         rig, log = driven_log(name, seed)
-        setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
-        driven, kinematic, _ = Handover(setup, Drive()).run_each(rows, pwm)
+        setup, rows = setup_for(rig, seed), rows_from(log)
+        driven, kinematic, _ = Handover(setup, Drive()).run_each(rows)
         tally = Tally(setup.bellows_radius_m)
-        tally.add(smooth_both(setup, Drive(), rows, pwm, driven, kinematic), truth(log))
+        tally.add(smooth_both(setup, Drive(), rows, driven, kinematic), truth(log))
         found = tally.rmse()
         figures.append((found["mean_q_mm"], found["phi_deg"], found["nees"]))
     mm, degrees, nees = np.mean(figures, axis=0)
@@ -563,11 +560,9 @@ def test_the_covariance_is_carried_as_by_the_whole_matrix() -> None:
 _ROWS = 600
 
 
-def _short(name: str, seed: int) -> tuple[Setup, tuple[Rows, FloatArray]]:
+def _short(name: str, seed: int) -> tuple[Setup, Rows]:
     rig, log = driven_log(name, seed)
-    rows = rows_from(log)
-    part = rows[:_ROWS]
-    return setup_for(rig, seed), (part, commands_of(log)[:_ROWS])
+    return setup_for(rig, seed), rows_from(log)[:_ROWS]
 
 
 def test_a_walk_that_is_far_too_loud_is_mended_and_none_is_taken_for_nothing() -> None:
@@ -576,7 +571,7 @@ def test_a_walk_that_is_far_too_loud_is_mended_and_none_is_taken_for_nothing() -
     loud = scaled(nominal, "rates", 30.0)
     steps: list[int] = []
     found, factors = tune_driven(setup, loud, [log], lambda done, total: steps.append(total - done))
-    assert driven_likelihood(setup, found, [log]) > driven_likelihood(setup, loud, [log]) + 10.0
+    assert log_likelihood(setup, [log], found) > log_likelihood(setup, [log], loud) + 10.0
     assert factors["rates"].value == 0.5
     assert all(factors[walk].value >= 0.5 for walk in WALKS)
     assert steps == [3, 2, 1]
@@ -584,11 +579,10 @@ def test_a_walk_that_is_far_too_loud_is_mended_and_none_is_taken_for_nothing() -
 
 def test_a_plant_that_is_pushed_about_asks_for_a_disturbance() -> None:
     """A command that the estimator is not told of is a force that nothing explains."""
-    setup, (rows, pwm) = _short("step", 2)
-    blind = pwm.copy()
-    blind[rows.t_s > 2.0] *= 0.99
-    _, told = tune_driven(setup, Drive(), [(rows, pwm)])
-    _, fooled = tune_driven(setup, Drive(), [(rows, blind)])
+    setup, rows = _short("step", 2)
+    blind = np.where((rows.t_s > 2.0)[:, None], 0.99, 1.0) * rows.pwm
+    _, told = tune_driven(setup, Drive(), [rows])
+    _, fooled = tune_driven(setup, Drive(), [replace(rows, pwm=blind)])
     assert fooled["disturbance"].value > 2.0 * told["disturbance"].value
 
 
@@ -613,9 +607,9 @@ def test_smoothed_angles_of_a_swing_are_as_sure_as_they_say_from_its_beginning()
     squares = []
     for seed in (1, 2, 12, 22):
         rig, log = driven_log("swing", seed)
-        setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
-        filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-        smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+        setup, rows = setup_for(rig, seed), rows_from(log)
+        filtered = DrivenFilter(setup, Drive()).run(rows)
+        smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
         early = (rows.t_s > 0.2) & (rows.t_s < 1.0)
         z = (smoothed[early, 5] - truth(log)[early, 2]) / smoothed[early, 12]
         squares.append(np.mean(z**2))
@@ -628,9 +622,9 @@ def test_smoothing_lessens_the_error(name: str) -> None:
     figures = []
     for seed in (11, 12):
         rig, log = driven_log(name, seed)
-        setup, rows, pwm = setup_for(rig, seed), rows_from(log), commands_of(log)
-        filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-        smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+        setup, rows = setup_for(rig, seed), rows_from(log)
+        filtered = DrivenFilter(setup, Drive()).run(rows)
+        smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
         known = np.isfinite(smoothed[:, 1])
         assert known[rows.t_s > 0.2].all()
         before, after = Tally(setup.bellows_radius_m), Tally(setup.bellows_radius_m)
@@ -646,11 +640,11 @@ def test_smoothing_lessens_the_error(name: str) -> None:
 
 def test_after_a_gap_the_forces_are_not_taken_as_none() -> None:
     rig, log = driven_log("elongation", 1)
-    rows, pwm, setup = rows_from(log), commands_of(log), setup_for(rig, 1)
+    rows, setup = rows_from(log), setup_for(rig, 1)
     some = (log.t_s < 4.0) | (log.t_s > 7.0)
-    rows, pwm, true = rows[some], pwm[some], truth(log)[some]
-    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    rows, true = rows[some], truth(log)[some]
+    filtered = DrivenFilter(setup, Drive()).run(rows)
+    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
     late = rows.t_s > 7.5
     assert np.abs(filtered[late, 1] - true[late, 0]).max() < 1e-3
     assert np.abs(smoothed[late, 1] - true[late, 0]).max() < 5e-4
@@ -660,12 +654,12 @@ def test_after_a_gap_the_forces_are_not_taken_as_none() -> None:
 def test_smoothing_stands_readings_that_are_thought_exact(name: str) -> None:
     """An IMU that is a hundred times as noisy as it is said to be."""
     rig, log = driven_log(name, 3)
-    setup, rows, pwm = setup_for(rig, 3), rows_from(log), commands_of(log)
+    setup, rows = setup_for(rig, 3), rows_from(log)
     noise = setup.noise.copy()
     noise[2:5] = 1e-4
     setup = replace(setup, noise=noise)
-    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    filtered = DrivenFilter(setup, Drive()).run(rows)
+    smoothed = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
     known = np.isfinite(smoothed[:, 1])
     assert known[rows.t_s > 0.5].all()
     assert np.abs(smoothed[known, 1] - truth(log)[known, 0]).max() < 5e-3
@@ -673,12 +667,12 @@ def test_smoothing_stands_readings_that_are_thought_exact(name: str) -> None:
 
 def test_windows_make_little_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, log = driven_log("elongation", 1)
-    setup, rows, pwm = setup_for(rig, 1), rows_from(log), commands_of(log)
-    filtered = DrivenFilter(setup, Drive()).run(rows, pwm)
-    whole = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    setup, rows = setup_for(rig, 1), rows_from(log)
+    filtered = DrivenFilter(setup, Drive()).run(rows)
+    whole = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
     monkeypatch.setattr(driven_smoother, "WINDOW", 800)
     monkeypatch.setattr(driven_smoother, "OVERLAP", 1500)
-    parts = driven_smoother.smooth_driven(setup, Drive(), rows, pwm, filtered)
+    parts = driven_smoother.smooth_driven(setup, Drive(), rows, filtered)
     late = rows.t_s > 1.0
     difference = np.abs(whole - parts)[late, 1:3]
     assert (difference < 0.5 * whole[late, 10:12]).all()
@@ -763,8 +757,8 @@ def test_hostile_logs_break_nothing(seed: int) -> None:
     name = list(SCENARIOS)[seed % len(SCENARIOS)]
     rig, log = simulated(name, 1)
     setup, drive = setup_for(rig, 1), Drive()
-    rows, pwm = hostile(seed, rows_from(log), commands_of(log))
-    driven, kinematic, weight = Handover(setup, drive).run_each(rows, pwm)
+    rows = hostile(seed, rows_from(log))
+    driven, kinematic, weight = Handover(setup, drive).run_each(rows)
     for out in (driven, kinematic, blended(driven, kinematic, weight)):
         assert unsound(out) == ""
-    assert unsound(smooth_both(setup, drive, rows, pwm, driven, kinematic)) == ""
+    assert unsound(smooth_both(setup, drive, rows, driven, kinematic)) == ""

@@ -14,11 +14,10 @@ from calib.core.arrays import FloatArray
 from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log, Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
-from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive
+from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive, Handover
 from calib.stages.estimator.kinematic import FLAGS, OUT
 from calib.stages.estimator.read import READINGS
 from calib.stages.estimator.replay import (
-    Estimate,
     consistent,
     contradicting,
     grown,
@@ -77,13 +76,12 @@ def _faulty(log: Log, other: Log) -> Iterator[tuple[str, str, Log]]:
 def _judged(log: Log) -> tuple[str, float]:
     """The verdict's word, and the error against the truth in deviations, root mean square of the worst."""
     setup, tally, watch = setup_for(varied_drive(0)), Tally(0.0126), Watch(READINGS)
-    estimate = Estimate(setup, Drive(), "auto")
-    out, true = estimate(rows_from(log), log), truth(log)
+    estimate = Handover(setup, Drive())
+    out, true = estimate.run(rows_from(log)), truth(log)
     tally.add(out, true)
     watch.add(log)
     checks = {sensor: check for sensor in SENSORS if (check := tally.check(sensor)) is not None}
     flags = {flag: tally.flags[bit] for flag, bit in FLAGS.items() if tally.flags.get(bit)}
-    assert estimate.sensor is not None
     findings: list[Finding] = [
         *sampled(watch),
         *consistent(checks, flags, len(out)),
@@ -164,7 +162,7 @@ def test_an_angle_that_gravity_contradicts_is_told(scenario: str, far_px: float)
     for aside_px in (0.0, far_px):
         moved = replace(log, columns={**log.columns, "u_px": log.columns["u_px"] + aside_px})
         tally = Tally(0.0126)
-        tally.add(Estimate(setup, Drive(), "auto")(rows_from(moved), moved))
+        tally.add(Handover(setup, Drive()).run(rows_from(moved)))
         told = [one.text for one in leaning(setup, tally)]
         assert bool(told) == (aside_px > 0.0), told
 
@@ -179,8 +177,8 @@ def test_a_camera_that_moved_along_the_actuator_is_told(scenario: str) -> None:
     drive = Drive(sigma=tuple(sigma), covariance=np.diag(sigma**2))
     for along_px in (0.0, -2.0, 2.0):
         moved = replace(log, columns={**log.columns, "v_px": log.columns["v_px"] + along_px})
-        estimate = Estimate(setup, drive, "auto")
-        estimate(rows_from(moved), moved)
+        estimate = Handover(setup, drive)
+        estimate.run(rows_from(moved))
         longer_m, sigma_m = estimate.longer_m
         assert bool(list(grown(longer_m, sigma_m))) == (along_px != 0.0), longer_m
         assert along_px * longer_m >= 0.0
@@ -262,7 +260,7 @@ def test_a_camera_that_moves_is_named_with_the_time(
     moved = replace(log, columns={**log.columns, name: shifted})
     tally = Tally(0.0126)
     rows = rows_from(moved)
-    tally.add(Estimate(setup_for(varied_drive(0)), Drive(), "auto")(rows, moved), None, rows.readings[:, :2])
+    tally.add(Handover(setup_for(varied_drive(0)), Drive()).run(rows), None, rows.readings[:, :2])
     said = [finding.text for finding in jumped(tally)]
     if px and lasts_s > 2.0:
         assert [text.startswith(f"at {t_s:.1f} s the marker jumps") for text in said] == [True]

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 import peers
 import pytest
-from drivenlogs import commands_of, driven_log
+from drivenlogs import driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated, truth, truth_of_sensors
 from numba.core.dispatcher import Dispatcher
 from scipy.stats import truncnorm
@@ -858,7 +858,7 @@ def test_readings_as_old_as_the_alignment_says_are_weighed_by_their_age() -> Non
             for k in range(2, 5):
                 readings[some, k] = np.interp(renewed_s, rows.t_s[some], readings[some, k])
             tally = Tally(setup.bellows_radius_m)
-            out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings), commands_of(log))
+            out = DrivenFilter(setup, Drive()).run(replace(rows, readings=readings))
             tally.add(out, truth(log))
             figures.append([tally.rmse()[key] for key in ("mean_q_mm", "phi_deg", "nees")])
         found.append(np.mean(figures, axis=0))

@@ -1280,7 +1280,10 @@ def run_driven(
 
 
 class DrivenFilter:
-    """A driven filter at work: rows and commands in, estimates out, with memory of the last events only."""
+    """A driven filter at work: rows in, estimates out, with memory of the last events only."""
+
+    sensor = None
+    """Unlike that of `Filter` it says nothing of the calibration: the plant has a say in it."""
 
     def __init__(self, setup: Setup, drive: Drive) -> None:
         self.setup, self.drive = setup, drive
@@ -1299,9 +1302,9 @@ class DrivenFilter:
             np.zeros((DYNAMIC, INVOLVED)), np.zeros(WORK), np.empty((0, TRACE)),
         )  # fmt: skip
 
-    def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
-        """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
-        out = np.empty((len(rows), len(OUT)))
+    def run(self, rows: Rows) -> FloatArray:
+        """Estimates (n, len(OUT)) at the rows' stamps; call again with the rows that follow."""
+        pwm, out = rows.commands, np.empty((len(rows), len(OUT)))
         driven = np.asarray(np.nan_to_num(pwm).max(axis=1, initial=0.0), dtype=np.float64)
         forces = commands(self.drive, pwm, self._held)
         run_driven(
@@ -1475,10 +1478,10 @@ def _switches(t: FloatArray, forces: FloatArray, period: float, lag_s: float) ->
 
 
 def _timeline(
-    setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray
+    setup: Setup, drive: Drive, rows: Rows
 ) -> tuple[FloatArray, IntArray, FloatArray, IntArray, Switches]:
     """Times, kinds, readings (n, 4) and rows of all events, and when commands act with their forces."""
-    events = events_of(setup, rows)
+    events, pwm = events_of(setup, rows), rows.commands
     forces = commands(drive, pwm)
     ticks = rows.t_s.copy()
     camera = np.nonzero(rows.kinds & 1)[0]
@@ -1509,16 +1512,15 @@ def _timeline(
     return np.concatenate([t, more_t])[order], kinds, readings, at, switches
 
 
-def smooth_driven(setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, outputs: FloatArray) -> FloatArray:
+def smooth_driven(setup: Setup, drive: Drive, rows: Rows, outputs: FloatArray) -> FloatArray:
     """Smoothed estimates (n, len(OUT)) at the rows' stamps; NaN where the filter had not started.
 
     Parameters
     ----------
-    pwm : (n, 2) commands, NaN in rows without.
     outputs : (n, len(OUT)) of the driven filter; what it says of innovations and flags is kept, and where it
         says that the head was let go, it was.
     """
-    t, kinds, readings, at, switches = _timeline(setup, drive, rows, pwm)
+    t, kinds, readings, at, switches = _timeline(setup, drive, rows)
     model = drive.model(setup)
     x, P = model.x0.copy(), model.P0.copy()
     marks = np.array([0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
@@ -1688,7 +1690,7 @@ leaves it .35 at most."""
 
 
 class Handover:
-    """Both filters at work and the weighing of them; rows and commands in, estimates out."""
+    """Both filters at work and the weighing of them; rows in, estimates out."""
 
     def __init__(self, setup: Setup, drive: Drive) -> None:
         self._before = starting_state(setup)[0][0, 6:]
@@ -1696,9 +1698,9 @@ class Handover:
         self._kinematic, self._driven = Filter(setup), DrivenFilter(setup, drive)
         self._memory = new_handover()
 
-    def run_each(self, rows: Rows, pwm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def run_each(self, rows: Rows) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Estimates of the driven and of the kinematic filter (n, len(OUT)), and the driven one's weight."""
-        driven, kinematic = self._driven.run(rows, pwm), self._kinematic.run(rows)
+        driven, kinematic = self._driven.run(rows), self._kinematic.run(rows)
         weight = np.empty(len(rows))
         weigh(driven, kinematic, self._memory, BEGIN, weight)
         self._weighed += int(np.isfinite(weight).sum())
@@ -1722,13 +1724,13 @@ class Handover:
         """As `DrivenFilter.longer_m`."""
         return self._driven.longer_m
 
-    def run(self, rows: Rows, pwm: FloatArray) -> FloatArray:
-        """Estimates (n, len(OUT)) of rows with commands (n, 2); call again with the rows that follow."""
-        return blended(*self.run_each(rows, pwm))
+    def run(self, rows: Rows) -> FloatArray:
+        """Estimates (n, len(OUT)) at the rows' stamps; call again with the rows that follow."""
+        return blended(*self.run_each(rows))
 
 
 def smooth_both(
-    setup: Setup, drive: Drive, rows: Rows, pwm: FloatArray, driven: FloatArray, kinematic: FloatArray
+    setup: Setup, drive: Drive, rows: Rows, driven: FloatArray, kinematic: FloatArray
 ) -> FloatArray:
     """Smoothed estimates (n, len(OUT)) of both models, weighed by what both sides of a row say.
 
@@ -1742,7 +1744,7 @@ def smooth_both(
     back[:, 0] = -back[:, 0]
     weigh(back, kinematic[::-1].copy(), new_handover(), 0.0, after)
     return blended(
-        smooth_driven(setup, drive, rows, pwm, driven),
+        smooth_driven(setup, drive, rows, driven),
         smooth(setup, rows, kinematic),
         np.minimum(weight, after[::-1]),
     )

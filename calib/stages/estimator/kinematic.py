@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -583,24 +584,35 @@ class Rows:
     readings : (n, 5) u, v [px], a_x, a_y [m/s^2], g_z [rad/s].
     kinds : (n,) 1 for the camera's tick, with or without a marker, 2 for an IMU sample, 3 for both.
     waited_s : (n,) how long before their stamp readings were taken, for those that come in bursts; or (0,).
+    pwm : (n, 2) commands of the pumps; or (0, 2).
     """
 
     t_s: FloatArray
     readings: FloatArray
     kinds: IntArray
     waited_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    pwm: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def taken_s(self) -> FloatArray:
         """What the clocks take for stamps (n,) [s]."""
         return self.t_s - self.waited_s if len(self.waited_s) else self.t_s
 
+    @property
+    def commands(self) -> FloatArray:
+        """Commands (n, 2), NaN in rows without."""
+        return self.pwm if len(self.pwm) else np.full((len(self), 2), math.nan)
+
     def __len__(self) -> int:
         return len(self.t_s)
 
     def __getitem__(self, part: slice | BoolArray | IntArray) -> Rows:
-        waited_s = self.waited_s[part] if len(self.waited_s) else self.waited_s
-        return Rows(self.t_s[part], self.readings[part], self.kinds[part], waited_s)
+        return Rows(*(values[part] if len(values) else values for values in vars(self).values()))
+
+    @staticmethod
+    def joined(parts: Sequence[Rows]) -> Rows:
+        """Rows of a log in one piece."""
+        return Rows(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 # ----------------------------------------------------------------------
@@ -1074,6 +1086,9 @@ def starting_state(setup: Setup, rows: Rows | None = None) -> tuple[FloatArray, 
 
 class Filter:
     """A filter at work: rows in, estimates out, with memory of the last events only."""
+
+    longer_m = None
+    """As of `driven.DrivenFilter`, whose plant alone has a length at rest."""
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup

@@ -74,9 +74,11 @@ def _of(out: FloatArray) -> float:
     return float(np.nansum(out[:, OUT.index("log_likelihood")]) - GATED * np.nansum(out[:, _GATES]))
 
 
-def log_likelihood(setup: Setup, logs: Sequence[Rows]) -> float:
-    """Of all logs by the kinematic filter."""
-    return sum(_of(Filter(setup).run(rows)) for rows in logs)
+def log_likelihood(setup: Setup, logs: Sequence[Rows], drive: Drive | None = None) -> float:
+    """Of all logs by the kinematic filter, or by the driven one."""
+    return sum(
+        _of((Filter(setup) if drive is None else DrivenFilter(setup, drive)).run(rows)) for rows in logs
+    )
 
 
 def best(values: FloatArray, likelihood: Callable[[float], float]) -> tuple[Estimate, float]:
@@ -174,9 +176,6 @@ _DRIVEN_NOISE_FACTORS = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
 _CONVINCING = 2.0
 """So much the log likelihood must rise, the gain of one number that means something."""
 
-Log = tuple[Rows, FloatArray]
-"""Rows and their commands (n, 2)."""
-
 
 def scaled(drive: Drive, walk: str, factor: float) -> Drive:
     """A drive with one of `WALKS` scaled."""
@@ -187,13 +186,8 @@ def scaled(drive: Drive, walk: str, factor: float) -> Drive:
     return replace(drive, **changed)
 
 
-def driven_likelihood(setup: Setup, drive: Drive, logs: Sequence[Log]) -> float:
-    """Of all logs by the driven filter."""
-    return sum(_of(DrivenFilter(setup, drive).run(rows, pwm)) for rows, pwm in logs)
-
-
 def tune_driven(
-    setup: Setup, drive: Drive, logs: Sequence[Log], progress: Callable[[int, int], None] | None = None
+    setup: Setup, drive: Drive, logs: Sequence[Rows], progress: Callable[[int, int], None] | None = None
 ) -> tuple[Drive, dict[str, Estimate]]:
     """The drive with the walks that the log with the greatest need of each asks for, and their factors."""
     factors: dict[str, Estimate] = {}
@@ -205,8 +199,8 @@ def tune_driven(
                 progress(done, steps)
             done += 1
 
-            def likelihood(factor: float, walk: str = walk, log: Log = log, now: Drive = drive) -> float:
-                return driven_likelihood(setup, scaled(now, walk, factor), [log])
+            def likelihood(factor: float, walk: str = walk, log: Rows = log, now: Drive = drive) -> float:
+                return log_likelihood(setup, [log], scaled(now, walk, factor))
 
             found, reached = best(_DRIVEN_NOISE_FACTORS, likelihood)
             if reached - likelihood(1.0) < _CONVINCING:

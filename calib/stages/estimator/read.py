@@ -138,7 +138,7 @@ def rows_of(log: Log, found: Periods) -> Rows:
     for own in map(np.flatnonzero, buffered):
         for part in np.split(own, np.flatnonzero(np.diff(t[own]) < 0.0) + 1):
             waited[part] = t[part] - time_axis(t[part]).t_s
-    return Rows(t, readings, kinds, waited)
+    return Rows(t, readings, kinds, waited, pwm_of(log))
 
 
 def truth_of(log: Log, setup: Setup) -> FloatArray | None:

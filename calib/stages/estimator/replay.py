@@ -60,7 +60,6 @@ from calib.stages.estimator.read import (
     has_commands,
     noise_at_rest,
     periods,
-    pwm_of,
     quiet_shares,
     rows_of,
     scored_by_pose,
@@ -136,13 +135,13 @@ def compile_filters(driven: bool, smoothed: bool) -> None:
     """
     readings = np.full((3, 5), np.nan)
     readings[:, 2:] = 9.81, 0.0, 0.0
-    rows, pwm = Rows(np.array([0.0, 0.01, 0.02]), readings, np.full(3, 2)), np.full((3, 2), np.nan)
+    rows = Rows(np.array([0.0, 0.01, 0.02]), readings, np.full(3, 2))
     start = Start(np.zeros(len(SENSOR)), np.ones(len(SENSOR)))
     setup = Setup(np.ones(25), np.ones(len(NOISE)), start, 0.02)
     if driven:
-        out = DrivenFilter(setup, Drive()).run(rows, pwm)
+        out = DrivenFilter(setup, Drive()).run(rows)
         if smoothed:
-            smooth_driven(setup, Drive(), rows, pwm, out)
+            smooth_driven(setup, Drive(), rows, out)
     else:
         out = Filter(setup).run(rows)
         if smoothed:
@@ -261,33 +260,11 @@ def drive_for(log: OpenLog, rig: Rig, model: str) -> Drive | None:
     return None
 
 
-class Estimate:
-    """The filter at work on the blocks of a log."""
-
-    def __init__(self, setup: Setup, drive: Drive | None, model: str) -> None:
-        self._kinematic = Filter(setup) if drive is None else None
-        self._driven = (
-            None if drive is None else (DrivenFilter if model == "driven" else Handover)(setup, drive)
-        )
-
-    def __call__(self, rows: Rows, log: Log) -> FloatArray:
-        """Rows of `OUT` for the rows of this block."""
-        if self._kinematic is not None:
-            return self._kinematic.run(rows)
-        assert self._driven is not None
-        return self._driven.run(rows, pwm_of(log))
-
-    @property
-    def sensor(self) -> FloatArray | None:
-        """As `Filter.sensor`; None with the driven model alone, whose plant has a say in it."""
-        if self._kinematic is not None:
-            return self._kinematic.sensor
-        return self._driven.sensor if isinstance(self._driven, Handover) else None
-
-    @property
-    def longer_m(self) -> tuple[float, float] | None:
-        """As `DrivenFilter.longer_m`; None without the driven model."""
-        return None if self._driven is None else self._driven.longer_m
+def estimator_for(setup: Setup, drive: Drive | None, model: str) -> Filter | DrivenFilter | Handover:
+    """The filter of a model, with both where "auto" has a `drive`."""
+    if drive is None:
+        return Filter(setup)
+    return DrivenFilter(setup, drive) if model == "driven" else Handover(setup, drive)
 
 
 # ----------------------------------------------------------------------
@@ -299,16 +276,6 @@ _FILTERPY_ROWS = 100_000
 """Filterpy's filter keeps 13 kB for each row and takes two minutes for so many."""
 
 
-def joined(parts: list[Rows]) -> Rows:
-    """Rows of a log in one piece."""
-    return Rows(
-        np.concatenate([part.t_s for part in parts]),
-        np.concatenate([part.readings for part in parts]),
-        np.concatenate([part.kinds for part in parts]),
-        np.concatenate([part.waited_s for part in parts]),
-    )
-
-
 def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
     """Rows (n, len(OUT)) of the kinematic smoother up to a time of the log [s], which may be its end."""
     parts = []
@@ -318,7 +285,7 @@ def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
         parts.append(rows[some])
         if not some.all():
             break
-    whole = joined(parts)
+    whole = Rows.joined(parts)
     return smooth(log.setup, whole, Filter(log.setup).run(whole))
 
 
@@ -334,44 +301,37 @@ class Smoothed:
     longer_m: tuple[float, float] | None
 
 
+def _whole(setup: Setup, found: Periods, stream: Iterable[Log]) -> tuple[Rows, FloatArray]:
+    """Rows of a log in one piece, and the truth (n, 3), NaN where it is not known."""
+    parts, truths = [], []
+    for block in stream:
+        parts.append(rows_of(block, found))
+        truth = truth_of(block, setup)
+        truths.append(np.full((len(block), 3), np.nan) if truth is None else truth)
+    return Rows.joined(parts), np.concatenate(truths)
+
+
 def filterpy_log(log: OpenLog, stream: Iterable[Log]) -> tuple[FloatArray, FloatArray, Finding]:
     """Rows of `OUT` by filterpy's extended filter, the truth (n, 3), and how far ours is away."""
     from calib.stages.estimator.reference import replayed
 
-    parts, truths = [], []
-    for block in stream:
-        parts.append(rows_of(block, log.periods))
-        truth = truth_of(block, log.setup)
-        truths.append(np.full((len(block), 3), np.nan) if truth is None else truth)
-    out, apart = replayed(log.setup, joined(parts))
+    rows, truth = _whole(log.setup, log.periods, stream)
+    out, apart = replayed(log.setup, rows)
     text = f"the compiled filter with the same one level of noise is at most {apart:.0e} sigma away"
-    return out, np.concatenate(truths), Finding("remark", text)
+    return out, truth, Finding("remark", text)
 
 
 def smooth_log(setup: Setup, found: Periods, stream: Iterable[Log], drive: Drive | None = None) -> Smoothed:
-    """A log filtered block by block and smoothed as a whole; with a `drive` both models are weighed."""
-    parts, outs, truths, pwm, driven, kinematic = [], [], [], [], [], []
-    fused, both = Filter(setup), None if drive is None else Handover(setup, drive)
-    for log in stream:
-        rows, truth = rows_of(log, found), truth_of(log, setup)
-        parts.append(rows)
-        if both is None:
-            outs.append(fused.run(rows))
-        else:
-            pwm.append(pwm_of(log))
-            one, other, weight = both.run_each(rows, pwm[-1])
-            outs.append(blended(one, other, weight))
-            driven.append(one)
-            kinematic.append(other)
-        truths.append(np.full((len(log), 3), np.nan) if truth is None else truth)
-    whole, filtered = joined(parts), np.concatenate(outs)
+    """A log filtered and smoothed as a whole; with a `drive` both models are weighed."""
+    rows, truth = _whole(setup, found, stream)
     if drive is None:
-        out = smooth(setup, whole, filtered)
-    else:
-        commands = np.concatenate(pwm)
-        out = smooth_both(setup, drive, whole, commands, np.concatenate(driven), np.concatenate(kinematic))
-    sensor, longer_m = (fused.sensor, None) if both is None else (both.sensor, both.longer_m)
-    return Smoothed(filtered, out, np.concatenate(truths), sensor, longer_m)
+        fused = Filter(setup)
+        filtered = fused.run(rows)
+        return Smoothed(filtered, smooth(setup, rows, filtered), truth, fused.sensor, None)
+    both = Handover(setup, drive)
+    driven, kinematic, weight = both.run_each(rows)
+    out = smooth_both(setup, drive, rows, driven, kinematic)
+    return Smoothed(blended(driven, kinematic, weight), out, truth, both.sensor, both.longer_m)
 
 
 def _watched(stream: Iterator[Log], watch: Watch, most: int, option: str) -> Iterator[Log]:
@@ -892,8 +852,8 @@ def replay_log(
         else:
             pictures = log.both and not log.periods.pose
             baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if pictures else None
-            estimate = Estimate(log.setup, drive, model)
-            _stream(log, estimate, baseline, fused, sums, write, progress)
+            estimate = estimator_for(log.setup, drive, model)
+            _stream(log, estimate.run, baseline, fused, sums, write, progress)
             sensor, longer_m = estimate.sensor, estimate.longer_m
             if fused and sums.baseline.scored:
                 compared["baseline"] = _lengths_and_angle(sums.baseline)
@@ -943,7 +903,7 @@ def _states_to(
 
 def _stream(
     log: OpenLog,
-    estimate: Callable[[Rows, Log], FloatArray],
+    estimate: Callable[[Rows], FloatArray],
     baseline: Baseline | None,
     fused: bool,
     sums: Sums,
@@ -968,7 +928,7 @@ def _stream(
     with behind(finish) as hand:
         for block in ahead(log.stream):
             rows = rows_of(block, log.periods)
-            hand((block, rows, estimate(rows, block)))
+            hand((block, rows, estimate(rows)))
             done += len(block)
             if progress is not None:
                 progress(min(done * 80, size), size)

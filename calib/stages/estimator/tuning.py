@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
@@ -20,8 +19,8 @@ from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, design, tick_
 from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import Rows, Setup
 from calib.stages.estimator.noise import tune
-from calib.stages.estimator.read import drive_from_rig, noise_at_rest, pwm_of, rows_of
-from calib.stages.estimator.replay import joined, opened
+from calib.stages.estimator.read import drive_from_rig, noise_at_rest, rows_of
+from calib.stages.estimator.replay import opened
 from calib.stages.estimator.section import Estimator, EstimatorDriven, EstimatorGain
 
 _MOST_ROWS = 20_000
@@ -37,15 +36,14 @@ def gain_section(setup: Setup, rate_hz: float) -> EstimatorGain | None:
 
 
 def _driven_section(
-    setup: Setup, drive: Drive, logs: Sequence[tuple[Rows, FloatArray]], progress: ProgressCall | None
+    setup: Setup, drive: Drive, logs: Sequence[Rows], progress: ProgressCall | None
 ) -> tuple[EstimatorDriven | None, dict[str, float | None]]:
     """Walks of the driven model from the first 6,000 rows of the logs with commands, and their deviations."""
     from calib.stages.estimator.noise import tune_driven
 
-    known = [(rows, pwm) for rows, pwm in logs if np.isfinite(pwm).all(axis=1).any()]
-    if not known:
+    short = [rows[:_MOST_DRIVEN_ROWS] for rows in logs if np.isfinite(rows.commands).all(axis=1).any()]
+    if not short:
         return None, {}
-    short = [(rows[:_MOST_DRIVEN_ROWS], pwm[:_MOST_DRIVEN_ROWS]) for rows, pwm in known]
     found, factors = tune_driven(setup, drive, short, progress)
     turning, growing = found.walk_rates
     section = EstimatorDriven(
@@ -68,22 +66,20 @@ def tuned_section(
 
     Raises `BadInputError` for logs that cannot be used, or without camera and IMU.
     """
-    every, told, first, at_rest = [], [], None, None
+    every, first, at_rest = [], None, None
     bare = replace(rig, estimator=None)
     drive = drive_from_rig(bare)
     for path in logs:
         source = opened(path, bare, rig_path, options)
         if not source.both or source.periods.pose:
             raise BadInputError(f"{shown(path)}: tuning needs camera and IMU, and the log lacks one")
-        parts, commands, count = [], [], 0
+        parts, count = [], 0
         for log in source.stream:
             parts.append(rows_of(log, source.periods))
-            commands.append(pwm_of(log))
             count += len(log)
             if count >= _MOST_ROWS:
                 break
-        every.append(joined(parts))
-        told.append((every[-1], np.concatenate(commands)))
+        every.append(Rows.joined(parts))
         if first is None:
             first, at_rest = source.setup, noise_at_rest(bare, source.periods)
     if first is None:
@@ -91,7 +87,7 @@ def tuned_section(
     found_noise = tune(first, every, progress)
     sigma = {"jitter_px": found_noise.jitter_px.sigma}
     sigma |= {name: factor.sigma for name, factor in found_noise.factors.items()}
-    driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=at_rest), told, progress)
+    driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=at_rest), every, progress)
     sigma |= more
     findings = []
     if found_noise.jitter_px.sigma is None:
