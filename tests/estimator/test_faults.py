@@ -15,7 +15,7 @@ from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log, Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
 from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive, Handover
-from calib.stages.estimator.kinematic import FLAGS, OUT
+from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import READINGS
 from calib.stages.estimator.replay import (
     consistent,
@@ -81,10 +81,9 @@ def _judged(log: Log) -> tuple[str, float]:
     tally.add(out, true)
     watch.add(log)
     checks = {sensor: check for sensor in SENSORS if (check := tally.check(sensor)) is not None}
-    flags = {flag: tally.flags[bit] for flag, bit in FLAGS.items() if tally.flags.get(bit)}
     findings: list[Finding] = [
         *sampled(watch),
-        *consistent(checks, flags, len(out)),
+        *consistent(checks, tally.flags, len(out)),
         *contradicting(setup, estimate.sensor, tally.end_s - tally.start_s),
     ]
     late = out[:, 0] > out[0, 0] + 2.0

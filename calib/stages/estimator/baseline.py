@@ -132,13 +132,7 @@ class Baseline:
         """Estimates (n, len(BASELINE)) at the rows; call again with the rows that follow."""
         out = np.empty((len(rows), len(BASELINE)))
         _run(
-            rows.t_s,
-            rows.readings,
-            rows.kinds,
-            self._numbers,
-            self.setup.to_plane,
-            _SERIES,
-            self._memory,
+            rows.t_s, rows.readings, rows.kinds, self._numbers, self.setup.to_plane, _SERIES, self._memory,
             out,
-        )
+        )  # fmt: skip
         return out

@@ -17,7 +17,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, robust_sigma
 from calib.core.result import finite_or_none
-from calib.stages.estimator.kinematic import OUT
+from calib.stages.estimator.kinematic import FLAGS, OUT
 from calib.stages.estimator.section import SensorCheck
 
 SENSORS = {"camera": 2, "accel": 2, "gyro": 1}
@@ -108,8 +108,8 @@ class Tally:
     sensors: dict[str, FloatArray] = field(
         default_factory=lambda: {name: np.zeros(8) for name in (*SENSORS, "last", "beyond")}
     )
-    flags: dict[int, int] = field(default_factory=dict)
-    squares: FloatArray = field(default_factory=lambda: np.zeros(8))
+    flags: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FLAGS, 0))
+    squares: FloatArray = field(default_factory=lambda: np.zeros(7))
     jump: tuple[float, float] = (0.0, math.nan)
     """Where the pictures jump most, in deviations of what innovations sum up to, and when [s]."""
     across: FloatArray = field(default_factory=lambda: np.zeros(2))
@@ -128,8 +128,8 @@ class Tally:
         self.end_s = float(out[-1, 0])
         self.rows += len(out)
         flags = out[:, OUT.index("flags")].astype(np.int64)
-        for bit in (1, 2, 4, 8, 16, 32, 64):
-            self.flags[bit] = self.flags.get(bit, 0) + int(np.count_nonzero(flags & bit))
+        for name, bit in FLAGS.items():
+            self.flags[name] += int(np.count_nonzero(flags & bit))
         late = out[:, 0] >= self.start_s + SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])
@@ -199,12 +199,9 @@ class Tally:
         if len(out) == 0:
             return
         self.scored += len(out)
-        self.squares[0] += float(((out[:, 1] - truth[:, 0]) ** 2).sum())
-        self.squares[1] += float(((out[:, 2] - truth[:, 1]) ** 2).sum())
-        self.squares[2] += float(((out[:, 5] - truth[:, 2]) ** 2).sum())
-        self.squares[3] += float(nees(out, truth[:, :2], truth[:, 2], self.bellows_radius_m).sum())
-        for k in range(3):
-            self.squares[4 + k] += float((out[:, 10 + k] ** 2).sum())
+        self.squares[:3] += ((out[:, [1, 2, 5]] - truth) ** 2).sum(axis=0)
+        self.squares[3] += nees(out, truth[:, :2], truth[:, 2], self.bellows_radius_m).sum()
+        self.squares[4:] += (out[:, 10:13] ** 2).sum(axis=0)
 
     def rmse(self) -> dict[str, float]:
         """Errors against the truth, empty without one: q1, q2, their mean [mm], phi [deg], NEES."""

@@ -832,11 +832,9 @@ def driven_event(
     again : whether the event is done once more; then `gated` (3,) holds.
     trace : (3, `TRACE`) what each reading did, for the smoother; (0, `TRACE`) for nothing.
     """
-    for k in range(trace.shape[0]):
-        trace[k, TRACE - 1] = 0.0
+    trace[:, TRACE - 1] = 0.0
     if not again:
-        for k in range(report.shape[0]):
-            report[k] = math.nan
+        report[:] = math.nan
     log_l, noise = 0.0, model.noise
     stamp = stamp_variance(kind, noise, z)
     H, p, out, e = work[2:5], work[0], work[5], work[10]
@@ -1114,10 +1112,9 @@ def _do_again(
         if events.kind[now] == IMU and events.t[now] < real[_BEGUN] + SETTLING_S:
             z[0], z[1], gated[1] = math.nan, math.nan, 1.0
         if (whole[_STARTED] == 0 and events.kind[now] != HOSES) or events.kind[now] == 0:
-            for k in range(12 if now == own else 0):
-                room.report[k] = math.nan
-            for k in range(3):
-                gated[k] = 1.0
+            if now == own:
+                room.report[:] = math.nan
+            gated[:] = 1.0
             continue
         driven_event(
             x, P, events.kind[now], z, model, room.work, not (afresh or now == own),
@@ -1214,18 +1211,9 @@ def run_driven(
             )  # fmt: skip
         for turn in range(4):
             kind, when = _due(
-                turn,
-                stamp,
-                tick,
-                taken[row],
-                readings[row],
-                kinds[row],
-                driven[row],
-                events,
-                memory,
-                model,
+                turn, stamp, tick, taken[row], readings[row], kinds[row], driven[row], events, memory, model,
                 room.z,
-            )
+            )  # fmt: skip
             if kind < 0:
                 continue
             newest = whole[NEWEST]
@@ -1250,8 +1238,7 @@ def run_driven(
                 out[row, _LET_GO] = let_go_s
             report = room.report
             if kind == HOSES or kind == 0:
-                for k in range(12):
-                    report[k] = math.nan
+                report[:] = math.nan
             settle_event(whole, size, report, out, row)
             for k in range(3):
                 at = _REJECTED if k == 0 else _REJECTED_IMU
@@ -1376,8 +1363,7 @@ def _forward(
             last -= 1
         kind, z = kinds[k], readings[k]
         chained[k] = False
-        for i in range(3):
-            trace[k, i, TRACE - 1] = 0.0
+        trace[k, :, TRACE - 1] = 0.0
         if t[k] - begin > LONGEST_GAP_S:
             marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 0, 0
             marks[0], marks[1] = 0.0, 0.0
@@ -1460,10 +1446,7 @@ def _backward(
             look_back(kept_x[k], kept_P[k], y, Y, part, spread)
         undo_readings(trace[k], y, Y, part, spread)
         if not chained[k]:
-            for i in range(n):
-                y[i] = 0.0
-                for j in range(n):
-                    Y[i, j] = 0.0
+            y[:], Y[:] = 0.0, 0.0
         elif k and t[k] > t[k - 1]:
             _undo_step(y, Y, F[k], FY)
 

@@ -454,11 +454,9 @@ def bank_event(
             weights[new, m] = weights[old, m]
     weights[new, count] = since
     if not again:
-        for k in range(12):
-            report[k] = math.nan
+        report[:] = math.nan
     report[11] = 0.0
-    for k in range(trace.shape[0]):
-        trace[k, TRACE - 1] = 0.0
+    trace[:, TRACE - 1] = 0.0
     stamp = stamp_variance(kind, noise, z)
     for m in range(count):
         x, P, out = bank_x[new, m], bank_P[new, m], work[m, 3]
@@ -626,8 +624,7 @@ def begin_row(
     stamp: float, last: float, camera_clock: FloatArray, imu_clock: FloatArray, out: FloatArray, row: int
 ) -> bool:
     """Blank a row but for its stamp; whether time jumps there from the last one, where clocks start again."""
-    for k in range(out.shape[1]):
-        out[row, k] = math.nan
+    out[row] = math.nan
     out[row, 0] = stamp
     step = stamp - last
     jumps = step < _JUMP_S[0] or step > _JUMP_S[1]

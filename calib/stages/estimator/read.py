@@ -422,7 +422,8 @@ def _at_rest(rig: Rig, found: Periods) -> dict[str, float]:
     return {key: density * root for key, density in densities if density}
 
 
-def _noise(rig: Rig, found: Periods) -> FloatArray:
+def _noise(rig: Rig, found: Periods) -> dict[str, float]:
+    """Numbers of `event.NOISE` for a rig and a log."""
     numbers = NOISE | _at_rest(rig, found)
     numbers["grid_px"] = found.grid_px
     if rig.align is not None:
@@ -437,7 +438,7 @@ def _noise(rig: Rig, found: Periods) -> FloatArray:
             numbers["accel_x_mps2"] = numbers["accel_y_mps2"] = rig.estimator.accel_noise_mps2
         if rig.estimator.gyro_noise_radps is not None:
             numbers["gyro_radps"] = rig.estimator.gyro_noise_radps
-    return np.array(list(numbers.values()))
+    return numbers
 
 
 def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None:
@@ -446,10 +447,9 @@ def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None
     The noise that an alignment finds holds what its splines cannot follow as well, which suits a model that
     knows no better. Where it is much greater than that at rest, the moving rig shakes, and it holds.
     """
-    tuned, rest = rig.estimator, _at_rest(rig, found)
+    tuned, rest, moving = rig.estimator, _at_rest(rig, found), _noise(rig, found)
     if not rest or (tuned is not None and (tuned.accel_noise_mps2 or tuned.gyro_noise_radps)):
         return None
-    moving = dict(zip(NOISE, _noise(rig, found).tolist(), strict=True))
     x, y, z = (
         rest[key] if key in rest and moving[key] <= _SHAKEN * rest[key] else moving[key]
         for key in ("accel_x_mps2", "accel_y_mps2", "gyro_radps")
@@ -459,7 +459,7 @@ def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None
 
 def quiet_shares(rig: Rig, found: Periods) -> dict[str, float]:
     """By sensor the variance of its noise at rest over that of the filter, at most 1; empty if not known."""
-    moving = dict(zip(NOISE, _noise(rig, found).tolist(), strict=True))
+    moving = _noise(rig, found)
     shares = {key: min((one / moving[key]) ** 2, 1.0) for key, one in _at_rest(rig, found).items()}
     sensors = {"accel": ("accel_x_mps2", "accel_y_mps2"), "gyro": ("gyro_radps",)}
     return {
@@ -498,7 +498,8 @@ def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[st
         sensor_covariance=covariance,
     )
     setup = Setup(
-        view, _noise(rig, found), start, plant.bellows_radius_m, process=_process(rig),
+        view, np.array(list(_noise(rig, found).values())), start, plant.bellows_radius_m,
+        process=_process(rig),
         camera_period_s=found.camera_s if found.camera_even else math.nan,
         imu_period_s=found.imu_s if found.imu_even else math.nan,
         command_period_s=found.command_s, imu_delay_s=rig.imu_delay_s,

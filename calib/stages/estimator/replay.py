@@ -48,7 +48,7 @@ from calib.stages.estimator.driven import (
     smooth_driven,
 )
 from calib.stages.estimator.event import NOISE
-from calib.stages.estimator.kinematic import FLAGS, OUT, Filter, Rows, Setup, Start, starting_state
+from calib.stages.estimator.kinematic import OUT, Filter, Rows, Setup, Start, starting_state
 from calib.stages.estimator.noise import jitter_px, with_jitter
 from calib.stages.estimator.read import (
     READINGS,
@@ -69,7 +69,7 @@ from calib.stages.estimator.read import (
     truth_of,
 )
 from calib.stages.estimator.section import Errors, Held, Replayed, SensorCheck
-from calib.stages.estimator.sensors import SENSOR
+from calib.stages.estimator.sensors import QUANTITIES, SENSOR
 from calib.stages.estimator.smoother import smooth
 
 T = TypeVar("T")
@@ -449,14 +449,14 @@ _AWAY = 3.2
 _PLACES = {"camera": "pictures", "pose": "poses"}
 """Names of what sees the place, and words for its readings."""
 _CALIBRATED = {
-    "gyro_bias_radps": ("the gyroscope's bias", 1e-3),
-    "accel_bias_x_mps2": ("the accelerometer's bias along x", 0.03),
-    "accel_bias_y_mps2": ("the accelerometer's bias along y", 0.03),
-    "mount_angle_rad": ("the mount angle", 0.002),
-    "gyro_scale": ("the gyroscope's scale", 0.005),
-    "time_offset_s": ("the time offset of the pictures", 1e-3),
-    "accel_scale_x": ("the accelerometer's scale along x", 0.01),
-    "accel_scale_y": ("the accelerometer's scale along y", 0.01),
+    "gyro_bias_radps": 1e-3,
+    "accel_bias_x_mps2": 0.03,
+    "accel_bias_y_mps2": 0.03,
+    "mount_angle_rad": 0.002,
+    "gyro_scale": 0.005,
+    "time_offset_s": 1e-3,
+    "accel_scale_x": 0.01,
+    "accel_scale_y": 0.01,
 }
 """What a log may tell better than the calibration did, and from which difference on that matters: .2
 degrees, a hundredth of gravity or half of one of the motion, a millisecond."""
@@ -565,18 +565,18 @@ def contradicting(
     (before, *_), (P, *_), _ = starting_state(setup)
     walk = np.square(setup.process.sensor_walk) * max(duration_s, 0.0)
     sigma = np.sqrt(np.diag(P)[6:] + walk)
-    for name, (words, least) in _CALIBRATED.items():
+    for name, least in _CALIBRATED.items():
         k = SENSOR.index(name)
         away = float(sensor[k] - before[6 + k])
         if not abs(away) <= max(_AWAY * float(sigma[k]), least):
-            words = words.replace("pictures", place)
+            of = f" of the {place}" if name == "time_offset_s" else ""
             unit = {"radps": " rad/s", "mps2": " m/s^2", "rad": " rad", "s": " s"}.get(
                 name.rsplit("_", 1)[-1], ""
             )
             yield Finding(
                 "poor",
-                f"{words} is {away:+.2g}{unit} away from its calibration, {abs(away) / sigma[k]:.1f} times "
-                "its sigma",
+                f"{QUANTITIES[name].words}{of} is {away:+.2g}{unit} away from its calibration, "
+                f"{abs(away) / sigma[k]:.1f} times its sigma",
                 "check the columns of this log, or run calib align again",
             )
 
@@ -949,7 +949,6 @@ def _replayed(
     place = _PLACES[camera]
     named = {name: camera if name == "camera" else name for name in SENSORS}
     checks = {named[name]: check for name in SENSORS if (check := tally.check(name)) is not None}
-    flags = {name: tally.flags[bit] for name, bit in FLAGS.items() if tally.flags.get(bit)}
     share = sums.driven / sums.weighed if own and sums.weighed else None
     if own:
         seen = list(sampled(sums.watch))
@@ -964,7 +963,7 @@ def _replayed(
             findings += jumped(tally)
             findings += leaning(log.setup, tally)
         repeating = tally.repeating() if log.periods.grid_px > 0.0 else None
-        findings += consistent(checks, flags, max(tally.rows, 1), log.quiet, repeating)
+        findings += consistent(checks, tally.flags, max(tally.rows, 1), log.quiet, repeating)
         if not tally.end_s - tally.start_s >= SETTLED_S:
             text = f"the log is too short: innovations are judged from {SETTLED_S:g} s on"
             findings.append(Finding("poor", text))
@@ -991,6 +990,6 @@ def _replayed(
         rmse=rmse,
         compared=compared,
         sensors=checks if own else {},
-        flags=flags if own else {},
+        flags={name: count for name, count in tally.flags.items() if count and own},
         **judged(Verdict.of([*assumed, *findings])),
     )
