@@ -1371,7 +1371,8 @@ def turned(problem: Problem, fit: Fit) -> FloatArray:
             change[seen] = (by[:, :, _SHIFT] @ (away[:, ::-1] * np.array([[1.0], [-1.0]])))[:, :, 0]
             yield one, change
 
-    return _beside(problem, fit, across, range(len(problem.stretches)))[3]
+    moved = [_beside(problem, fit, across, [i])[3] for i in range(len(problem.stretches))]
+    return np.asarray(np.sum(moved, axis=0))
 
 
 def _accelerations_at(stretch: Stretch, late_s: float) -> Stretch:
