@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, say
+from calib.cli.common import JsonOption, answer, narrate
 from calib.core.words import as_text
 
 
@@ -44,8 +44,4 @@ def diff(
         check_writable(output, PAGE)
         write_diff_page(output, one, other, (shown(before), shown(after)), found)
         narrate(f"page written to {shown(output)}")
-    if as_json:
-        document("diff", asdict(found))
-        return
-    for line in as_text(list(found.blocks(every)), sys.maxsize):
-        say(line)
+    answer(as_json, "diff", asdict(found), *as_text(list(found.blocks(every)), sys.maxsize))

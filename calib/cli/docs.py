@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import JsonOption, document, emit, narrate, say
+from calib.cli.common import JsonOption, answer, emit, narrate
 from calib.core import __version__
 from calib.core.errors import BadInputError, UsageError
+from calib.core.words import nearest
 from calib.core.writing import Kind, holds
 
 if TYPE_CHECKING:
@@ -63,21 +64,15 @@ def docs(
     if print_page:
         emit(page.text)
         return
-    if list_topics and not as_json:
-        for one in pages:
-            say(f"  {one.topic:<16}{one.title}")
-        return
     topics = {one.topic: one.title for one in pages}
     if list_topics:
-        document("docs", {"docs": {"topics": topics}})
+        lines = (f"  {name:<16}{title}" for name, title in topics.items())
+        answer(as_json, "docs", {"docs": {"topics": topics}}, *lines)
         return
     folder = write_manual(pages, _cache() if output is None else output)
     path = folder / f"{page.name}.html"
-    if as_json:
-        document("docs", {"docs": {"page": str(path), "topics": topics}})
-        return
-    say(str(path))
-    if output is None and not _opened(path):
+    answer(as_json, "docs", {"docs": {"page": str(path), "topics": topics}}, str(path))
+    if output is None and not as_json and not _opened(path):
         narrate("no browser could be opened; open this file in one")
 
 
@@ -94,15 +89,12 @@ def manual() -> list[Page]:
 
 def page_of(topic: str, pages: list[Page]) -> Page:
     """The page of a topic. Raises `UsageError` with the nearest topic where there is none."""
-    import difflib
-
     wanted = topic.removesuffix(".md")
     for page in pages:
         if wanted in (page.topic, page.name):
             return page
-    near = difflib.get_close_matches(wanted, [page.topic for page in pages], n=1)
-    hint = f"did you mean {near[0]}?" if near else "calib docs --list names all"
-    raise UsageError(f"the manual has no page {topic[:60]!r}; {hint}")
+    hint = nearest(wanted, [page.topic for page in pages]) or "; calib docs --list names all"
+    raise UsageError(f"the manual has no page {topic[:60]!r}{hint}")
 
 
 PAGE = Kind("a page of the manual", (".html",), holds(b" - calib</title>"))

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, say
+from calib.cli.common import JsonOption, answer, narrate
 from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError, pip_install
 from calib.core.files import shown
@@ -70,15 +70,15 @@ def live(
         if (error.name or "").startswith("calib"):
             raise
         raise UsageError(f"calib live needs starlette and uvicorn: {pip_install('live')}") from error
-    told = Told(
+    asked = Told(
         None if corners is None else parse_corners(corners),
         None if square is None else parse_square_m(square),
     )
     album = Album(output)
     frames = source_of(source, album.images)
-    board, views, size_px = album.open(told)
-    stated = told.corners or (None if board.corners is None else (board.corners[0], board.corners[1]))
-    square_m = board.square_m if told.square_m is None else told.square_m
+    board, views, size_px = album.open(asked)
+    known = None if board.corners is None else (board.corners[0], board.corners[1])
+    stated, square_m = asked.corners or known, asked.square_m or board.square_m
     session = Session(stated, square_m, size_px, board.dictionary)
     session.views.update((view.name, view) for view in views)
     if views:
@@ -103,8 +103,7 @@ def live(
         narrate("ended; what was taken is saved")
     if not album.names() and set(album.logs.glob("*.csv")) - before:
         narrate(f"recordings are in {shown(album.logs)}; no picture was taken, so no camera is calibrated")
-        if as_json:
-            document("live", {"camera": None, "pictures": []})
+        answer(as_json, "live", {"camera": None, "pictures": []})
         return
     if not album.names():
         raise BadInputError(
@@ -112,11 +111,8 @@ def live(
             "space there; a video or a folder that is complete is for calib intrinsics"
         )
     camera = album.calibrate()
-    if as_json:
-        document("live", {"camera": section_json(camera), "pictures": album.names()})
-    else:
-        for line in as_text(described(camera)):
-            say(line)
+    told = {"camera": section_json(camera), "pictures": album.names()}
+    answer(as_json, "live", told, *as_text(described(camera)))
     narrate(f"camera written to {shown(album.rig)}")
     if not camera.verdict.ok:
         raise typer.Exit(EXIT_POOR)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, say
+from calib.cli.common import JsonOption, answer, narrate
 from calib.core.command import note_inputs
 from calib.core.files import shown
 from calib.core.writing import check_writable
@@ -31,8 +31,6 @@ def report(
     check_writable(target, PAGE)
     write_page(rig, target)
     size = target.stat().st_size
-    if as_json:
-        document("report", {"page": str(target), "bytes": size})
-    else:
-        say(f"{shown(target)}: {1e-6 * size:.1f} MB")
+    answer(as_json, "report", {"page": str(target), "bytes": size}, f"{shown(target)}: {1e-6 * size:.1f} MB")
+    if not as_json:
         narrate("open it in a browser")

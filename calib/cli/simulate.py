@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calib.cli.common import JsonOption, document, narrate, progress_bar, say
+from calib.cli.common import JsonOption, answer, narrate, progress_bar
 from calib.core.errors import UsageError
 from calib.core.files import shown
 from calib.core.units import parse_duration_s
@@ -103,9 +103,6 @@ def simulate(
         lines += [
             f"  {name} {'never' if value is None else f'{value:.4g}'}" for name, value in figures.items()
         ]
-    if as_json:
-        document("simulate", {"simulate": told})
-    else:
-        for line in lines:
-            say(line)
+    answer(as_json, "simulate", {"simulate": told}, *lines)
+    if not as_json:
         narrate("simulated: a model of a rig, not a recording of one")

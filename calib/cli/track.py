@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli.common import JsonOption, RigOption, document, narrate, progress_bar, refuse_recorded, say
+from calib.cli.common import JsonOption, RigOption, answer, narrate, progress_bar, refuse_recorded
 from calib.cli.interrupts import Interrupts
 from calib.core.errors import EXIT_POOR, BadInputError, UsageError
 from calib.core.files import shown
@@ -146,16 +146,14 @@ def track(
         "sigma_px": sorted(row[3] for row in rows)[len(rows) // 2],
         "times": times.words(),
     }
-    if as_json:
-        document("track", {"track": told})
-    else:
-        say(f"marker in {seen} of {len(found)} frames, written to {shown(output)}; {len(found) - seen} lost")
-        if tracker.doubled:
-            say(f"another disc of its colour in {tracker.doubled} frames")
-        if tracker.elsewhere:
-            say(tracker.doubt(at_s))
-        say(f"sigma of the centre {told['sigma_px']:.2f} px")
-        say(told["times"])
+    lines = [
+        f"marker in {seen} of {len(found)} frames, written to {shown(output)}; {len(found) - seen} lost",
+        f"another disc of its colour in {tracker.doubled} frames" if tracker.doubled else "",
+        tracker.doubt(at_s),
+        f"sigma of the centre {told['sigma_px']:.2f} px",
+        told["times"],
+    ]
+    answer(as_json, "track", {"track": told}, *filter(None, lines))
     other_size = calibrated_px not in (None, size_px)
     if other_size:
         narrate(_other_size(source, size_px, rig, calibrated_px))

@@ -22,6 +22,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.constants import Constant, constants
 from calib.core.geometry import box_grid
+from calib.core.result import OF_VERDICT
 from calib.core.words import Block, InWords, Line, Table, number, several
 
 Sections = Mapping[str, Mapping[str, Any]]
@@ -218,14 +219,12 @@ def _others(a: Mapping[str, Any], b: Mapping[str, Any], compared: set[str]) -> d
             if leaf not in compared and here.get(leaf, _NONE) != there.get(leaf, _NONE)
         ]  # fmt: skip
         keys = dict.fromkeys(re.split(r"[.[]", leaf)[1] for leaf in differ)
-        if found := tuple(key for key in keys if key not in _VERDICT):
+        if found := tuple(key for key in keys if key not in OF_VERDICT):
             out[section] = found
     return out
 
 
 _NONE = object()
-_VERDICT = ("verdict", "reasons", "remarks", "advice")
-"""Keys that `verdicts` tells of."""
 
 
 def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:

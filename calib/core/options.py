@@ -10,6 +10,7 @@ from typing import Any, Literal, get_type_hints
 from calib.core.arguments import taken
 from calib.core.errors import UsageError
 from calib.core.units import unit_of
+from calib.core.words import nearest
 
 
 def option(
@@ -101,10 +102,7 @@ def options_of(kind: type[Any], values: Mapping[str, Any], function: str = "") -
     parsed: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
-            import difflib
-
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]}?" if near else f", expected one of {', '.join(known)}"
+            hint = nearest(name, known) or f"; expected one of {', '.join(known)}"
             raise UsageError(f"{function}{': ' * bool(function)}{name} is not an option{hint}")
         parse, least = (known[name].metadata[key] for key in ("parse", "least"))
         flag = f"--{flag_of(known[name])}"

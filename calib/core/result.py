@@ -257,7 +257,8 @@ def judged(verdict: Verdict) -> dict[str, Any]:
 
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 """Writes the same text; the C library does it in a twentieth of the time."""
-_LAST = ("verdict", "reasons", "remarks", "advice")
+OF_VERDICT = ("verdict", "reasons", "remarks", "advice")
+"""Keys of a section that tell its verdict, the last in the file."""
 _UNWRITTEN = ("rejected", "remarks", "advice")
 """Lists that are not written where they are empty."""
 
@@ -268,8 +269,8 @@ def section_json(section: BaseModel, whole: bool = False) -> dict[str, Any]:
     Unset and empty parts are left out, unless the `whole` is asked for.
     """
     values = section.model_dump(mode="json", by_alias=True)
-    ordered = {key: values[key] for key in values if key not in _LAST}
-    ordered |= {key: values[key] for key in _LAST if key in values}
+    ordered = {key: values[key] for key in values if key not in OF_VERDICT}
+    ordered |= {key: values[key] for key in OF_VERDICT if key in values}
     if whole:
         return ordered
     return {

@@ -28,9 +28,9 @@ from calib.core import __version__
 from calib.core.arguments import checked, taken
 from calib.core.errors import BadInputError, NoSectionError, UsageError
 from calib.core.files import one_line, quoted, read_yaml_mapping, sha256, shown
-from calib.core.result import Result, Section, identity, section_json
-from calib.core.schema import nearest, validated
-from calib.core.words import Block, InWords, Table
+from calib.core.result import Number, Result, Section, identity, section_json
+from calib.core.schema import validated
+from calib.core.words import Block, InWords, Table, nearest
 from calib.core.writing import Kind, head, write_atomically
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def _holds_sections(path: Path) -> bool:
 SECTIONS = Kind("sections of a rig", (".yaml", ".yml"), _holds_sections, merged=True)
 """The file itself, for those who write it."""
 
-Metres = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
-Offset = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False, strict=True)]
+Metres = Annotated[Number, Field(ge=-10.0, le=10.0)]
+Offset = Annotated[Number, Field(ge=-0.5, le=0.5)]
 
 
 class Geometry(Section):
@@ -108,7 +108,7 @@ class Geometry(Section):
     imu_sign: Annotated[list[Literal[-1, 1]], Field(min_length=3, max_length=3)] | None = None
     """Signs by which the board multiplies ax, ay and gz as its IMU gives them, of one that is mirrored."""
 
-    imu_delay_s: Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False, strict=True)] = 0.0
+    imu_delay_s: Annotated[Number, Field(ge=0.0, le=0.1)] = 0.0
     """Age of the IMU's readings, as of its low-pass: of a second order .225 over its bandwidth."""
 
     @field_validator("workspace_m")

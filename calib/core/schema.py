@@ -6,9 +6,8 @@ number typed in another unit?
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +17,7 @@ from pydantic_core import PydanticCustomError
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, shown
 from calib.core.units import plain_number, unit_of
+from calib.core.words import nearest
 
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -88,19 +88,6 @@ def _refuse_endless(value: Any, source: Path | str, key: str) -> None:
 def contradiction(text: str) -> PydanticCustomError:
     """An error that a model's validator raises of values that cannot stand together; `text` names the key."""
     return PydanticCustomError("contradiction", "{text}", {"text": text})
-
-
-_MOST_NAMES = 8
-"""Names that a sentence tells at most."""
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """The end of a sentence that asks for the most alike of some names, or else tells a few of them."""
-    known = list(names)
-    alike = difflib.get_close_matches(name, known, 1)
-    if alike:
-        return f"; did you mean {alike[0]}?"
-    return f"; expected one of {', '.join(known)}" if 0 < len(known) <= _MOST_NAMES else ""
 
 
 def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:

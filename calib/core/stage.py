@@ -20,7 +20,7 @@ from calib.core.errors import BadInputError, CalibError, CopyError, SomeFailedEr
 from calib.core.files import hash_of, shown
 from calib.core.options import NoOptions
 from calib.core.verdict import Finding, Verdict
-from calib.core.words import Block, described
+from calib.core.words import Block, InWords, described
 
 if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
@@ -130,16 +130,11 @@ class Files:
         It cannot where that leaves less than half of the files, copies not counted, and for a name that leads
         nowhere, which a person has mistyped.
         """
-        said, starts = str(error), (": ", ", line ")
-        named = [
-            path
+        starts = (
+            tuple(f"{shown(name)}{then}" for name in (path, path.name) for then in (": ", ", line "))
             for path in self.paths
-            if any(
-                said.startswith(f"{name}{then}")
-                for name in {shown(path), shown(path.name)}
-                for then in starts
-            )
-        ]
+        )
+        named = [one for one, start in zip(self.paths, starts, strict=True) if str(error).startswith(start)]
         spoilt, whole = _without_copies([*self.left_out.values(), error], self.named)
         many = 2 * len(spoilt) > whole
         if len(named) != 1 or many or not named[0].exists():
@@ -243,7 +238,8 @@ class Stage(Generic[*Inputs]):
     on_request : option without which nothing is written into rig.yaml.
     needs : sections without which it cannot run. uses : those that it reads where they are.
     output : what the verb writes beside rig.yaml.
-    document : what --json prints beside the sections. words : blocks in front of the sections' own.
+    document : what --json prints beside the sections. words : blocks in front of the sections' own; an
+        outcome that is `InWords` has its own.
     plots : figures by the names of their files, without drawing them.
     remarks : sentences about the rig as it is after the stage.
     """
@@ -266,7 +262,7 @@ class Stage(Generic[*Inputs]):
     uses: tuple[str, ...] = ()
     output: Output | None = None
     document: Callable[[Any], dict[str, Any]] = lambda outcome: {}
-    words: Callable[[Any], Sequence[Block]] | None = None
+    words: Callable[[Any], Sequence[Block]] = lambda outcome: ()
     plots: Callable[[Any], dict[str, Figure]] | None = None
     remarks: Callable[[Rig], Sequence[str]] | None = None
 
@@ -387,8 +383,8 @@ class Stage(Generic[*Inputs]):
 
     def blocks(self, outcome: Any) -> list[Block]:
         """An outcome in words, for the terminal and the page."""
-        told = [] if self.words is None else list(self.words(outcome))
-        return [*told, *(block for one in self.results(outcome) for block in described(one))]
+        words = outcome.blocks() if isinstance(outcome, InWords) else self.words(outcome)
+        return [*words, *(block for one in self.results(outcome) for block in described(one))]
 
     def writes_rig(self, options: Any) -> bool:
         """Whether sections of rig.yaml are written with these options."""

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 BLANK = "\N{EN DASH}"
 """What stands for a value that is not there."""
 
-SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
-
 _SCALES = {
     ("m", "mm"): 1e3,
     ("s", "ms"): 1e3,
@@ -320,6 +318,21 @@ def counted(count: int, one: str) -> str:
 def all_of(names: Sequence[str]) -> str:
     """Names for a sentence, as a, b and c."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+_MOST_NAMES = 8
+"""Names that a sentence tells at most."""
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The end of a sentence that asks for the most alike of some names, or else tells a few of them."""
+    import difflib
+
+    known = list(names)
+    alike = difflib.get_close_matches(name, known, 1)
+    if alike:
+        return f"; did you mean {alike[0]}?"
+    return f"; expected one of {', '.join(known)}" if 0 < len(known) <= _MOST_NAMES else ""
 
 
 def listed(label: str, parts: Mapping[str, Any] | Sequence[Any]) -> Table:

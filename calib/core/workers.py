@@ -70,9 +70,12 @@ def processors() -> int:
 def at_most(count: int) -> Iterator[None]:
     """Use no more processors than this inside, for a process that is one of many on its machine."""
     _most.append(count)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(count)
     try:
         yield
     finally:
+        cv2.setNumThreads(threads)
         _most.pop()
 
 

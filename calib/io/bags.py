@@ -23,7 +23,7 @@ import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, package, pip_install
-from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown
+from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown, to_be
 from calib.core.words import several
 from calib.io.columns import COLUMNS, Block, Passed
 
@@ -698,22 +698,19 @@ def bag_blocks(path: Path, topics: Path | None = None) -> Iterator[tuple[tuple[s
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Source]:
     """The messages of a bag; what goes wrong while they are read is a `BadInputError` as well."""
-    source = shown(path)
-    if path.is_file() or not path.is_dir():
+    if not path.is_dir():
         check_readable(path)
     opened = _mcap if path.is_file() and path.suffix.lower() == ".mcap" else _rosbag
     try:
-        with opened(path) as stream:
+        with to_be("read", path), opened(path) as stream:
             yield stream
     except CalibError:
         raise
-    except OSError as error:
-        raise BadInputError(f"{source}: cannot be read: {error.strerror or error}") from error
     except Exception as error:
         # Damaged bytes make the packages raise nearly anything, and which is not part of their interface.
         said = one_line(str(error) or type(error).__name__)[:160]
         raise BadInputError(
-            f"{source}: is not a bag that can be read: {said}; if its recording was cut, {_mend(path)}"
+            f"{shown(path)}: is not a bag that can be read: {said}; if its recording was cut, {_mend(path)}"
         ) from error
 
 

@@ -25,13 +25,12 @@ columns.yaml lies beside the logs; `NAME.columns.yaml` goes before it for one of
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, read_yaml_mapping, shown
 from calib.core.options import LogOptions
 from calib.core.units import GRAVITY_MPS2
-from calib.core.words import several
+from calib.core.words import nearest, several
 from calib.core.writing import Kind, head
 
 MEASURED = (
@@ -295,22 +294,9 @@ class Passed:
     times: str = ""
 
     def __add__(self, later: Passed) -> Passed:
-        return Passed(
-            self.not_finite + later.not_finite,
-            self.beyond + later.beyond,
-            self.first or later.first,
-            self.truncated or later.truncated,
-            self.wraps + later.wraps,
-            self.outside + later.outside,
-            self.clipped + later.clipped,
-            self.end or later.end,
-            self.sorted + later.sorted,
-            self.twice + later.twice,
-            self.said + later.said,
-            self.damaged + later.damaged,
-            self.damage or later.damage,
-            self.times or later.times,
-        )
+        both = ((getattr(self, one.name), getattr(later, one.name)) for one in fields(self))
+        # Numbers add up; of words the first ones count.
+        return Passed(*(a + b if type(a) is int else a or b for a, b in both))
 
     @property
     def sentences(self) -> list[str]:
@@ -410,8 +396,7 @@ def read_columns_file(path: Path) -> ColumnsFile:
     allowed = ("t_s", *COLUMNS, *_RESERVED)
     for key in document:
         if key not in allowed:
-            near = difflib.get_close_matches(key, allowed, 1)
-            hint = f", did you mean {near[0]}" if near else f", expected t_s, {', '.join(MEASURED[:3])}, ..."
+            hint = nearest(key, allowed) or f"; expected t_s, {', '.join(MEASURED[:3])}, ..."
             raise BadInputError(f"{where}: {one_line(key)[:60]} is not known{hint}")
     names = document.get("names", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -182,9 +182,8 @@ class Log(InWords):
             rows = rows[(rows < a) | (rows >= b)]
         values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
         stamps = log.t_s[rows]
-        same = np.all((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1])), axis=1)
         # Of a burst, in which rows of other sensors lie between, both are readings.
-        twice = (np.diff(stamps) == 0.0) & (np.diff(rows) == 1) & same
+        twice = _again(stamps, values.T) & (np.diff(rows) == 1)
         if twice.any():
             kept = np.concatenate([[True], ~twice])
             rows, stamps, values = rows[kept], stamps[kept], values[kept]
@@ -225,14 +224,20 @@ _MARKER = ("u_px", "v_px")
 _MOST_OUTSIDE, _SENTINELS = 0.05, 2
 
 
+def _places(log: Log) -> tuple[IntArray, FloatArray]:
+    """Rows (n,) with the marker's place, and the places (n, 2)."""
+    rows = log.sampled(*_MARKER)
+    at = np.stack([log.columns[name][rows] for name in _MARKER], axis=1) if len(rows) else np.zeros((0, 2))
+    return rows, at
+
+
 def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
     """The log with blanks for markers outside of pictures of this width and height, and for those at (0, 0).
 
     Raises `BadInputError` where there are many, unless they hold the same few numbers, as those of a tracker
     that says so that it has lost the marker. No marker has its middle on the pixel in the corner.
     """
-    rows = log.sampled(*_MARKER)
-    at = np.stack([log.columns[name][rows] for name in _MARKER], axis=1) if len(rows) else np.zeros((0, 2))
+    rows, at = _places(log)
     outside = ~in_picture(at, size_px) | ~at.any(axis=1)
     if not outside.any():
         return log
@@ -283,8 +288,7 @@ def held_places(log: Log) -> str:
 
     Such places are late by up to a period of the camera.
     """
-    rows = log.sampled(*_MARKER)
-    at = np.stack([log.columns[name][rows] for name in _MARKER], axis=1) if len(rows) else np.zeros((0, 2))
+    _, at = _places(log)
     if len(at) <= 2 * _AROUND + _FEWEST_CHANGES:
         return ""
     same = np.concatenate([[False], (np.diff(at, axis=0) == 0.0).all(axis=1)])
@@ -512,23 +516,30 @@ def in_order(log: Log) -> Log:
     back = np.diff(log.t_s[by_writer]) < 0.0
     if (back & (np.diff(writer[by_writer]) == 0)).any():
         return log
-    rows = np.argsort(log.t_s, kind="stable")
+    return _of_rows(log, np.argsort(log.t_s, kind="stable"), Passed(sorted=int(late.sum())))
+
+
+def _of_rows(log: Log, rows: IntArray | BoolArray, passed: Passed) -> Log:
+    """Some rows of a log, or all in another order, and what that has passed over."""
     columns = {name: column[rows] for name, column in log.columns.items()}
-    passed = log.passed + Passed(sorted=int(late.sum()))
+    passed = log.passed + passed
     return replace(log, t_s=log.t_s[rows], columns=columns, lines=log.lines[rows], passed=passed)
 
 
 def once(log: Log) -> Log:
     """The log without rows that say what the one before says, at its time, which are no other readings."""
-    again = np.diff(log.t_s) == 0.0
-    for column in log.columns.values():
-        again &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    again = _again(log.t_s, log.columns.values())
     if not again.any():
         return log
-    rows = np.concatenate([[True], ~again])
-    columns = {name: column[rows] for name, column in log.columns.items()}
-    passed = log.passed + Passed(twice=int(again.sum()))
-    return replace(log, t_s=log.t_s[rows], columns=columns, lines=log.lines[rows], passed=passed)
+    return _of_rows(log, np.concatenate([[True], ~again]), Passed(twice=int(again.sum())))
+
+
+def _again(t_s: FloatArray, columns: Iterable[FloatArray]) -> BoolArray:
+    """Which rows (n - 1,) but the first of all say what the one before says, at its time."""
+    again: BoolArray = np.diff(t_s) == 0.0
+    for column in columns:
+        again &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    return again
 
 
 def log_text(log: Log) -> str:
@@ -678,10 +689,7 @@ class Signals:
     def without(self, *names: str) -> Signals:
         """The same without some columns."""
         kept = [k for k, name in enumerate(self.names) if name not in names]
-        return Signals(
-            self.source, tuple(self.names[k] for k in kept), self.stamps_s, self.values[:, kept], self.rows,
-            self.lines, self.repeated_rows, self.findings,
-        )  # fmt: skip
+        return replace(self, names=tuple(self.names[k] for k in kept), values=self.values[:, kept])
 
 
 _BEHIND = 4

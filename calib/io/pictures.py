@@ -12,9 +12,11 @@ import threading
 import warnings
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,10 +42,9 @@ _HEIF_BYTES = 1_000_000
 _ANIMATION_BYTES, _MOST_PAGES = 10_000, 1000
 
 
-def declared_pixels(data: bytes) -> int | None:
-    """Width times height by a picture's header; None where there is no header of a known kind."""
-    width, height = declared_size(data)
-    return width * height or None
+def declared_pixels(data: bytes) -> int:
+    """Width times height by a picture's header; 0 where there is no header of a known kind."""
+    return math.prod(declared_size(data))
 
 
 def declared_size(data: bytes) -> tuple[int, int]:
@@ -61,16 +62,22 @@ def declared_size(data: bytes) -> tuple[int, int]:
     from PIL import Image
 
     try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(data), formats=_BY_PILLOW) as image,
-        ):
+        with _opened(io.BytesIO(data), *_BY_PILLOW) as image:
             return image.width, image.height
     except Image.DecompressionBombError:
         return _MAX_PIXELS + 1, 1
     except Exception:
         # Damaged bytes make its readers raise nearly anything.
         return 0, 0
+
+
+@contextmanager
+def _opened(source: Path | io.BytesIO, *formats: str) -> Iterator[Any]:
+    """A picture of one of these formats, as Pillow reads it."""
+    from PIL import Image
+
+    with warnings.catch_warnings(action="ignore"), Image.open(source, formats=formats) as image:
+        yield image
 
 
 def _tiff_size(data: bytes) -> tuple[int, int]:
@@ -100,13 +107,8 @@ def count_pictures(data: bytes) -> int:
         return max(data.count(b"ANMF"), 1)
     if data[:4] not in _TIFF:
         return 1
-    from PIL import Image
-
     try:
-        with (
-            warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(data), formats=("TIFF",)) as image,
-        ):
+        with _opened(io.BytesIO(data), "TIFF") as image:
             size, same = image.size, 1
             for page in range(1, min(getattr(image, "n_frames", 1), _MOST_PAGES)):
                 image.seek(page)
@@ -256,7 +258,7 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     if problem is not None:
         raise BadInputError(f"{where}: {problem}")
     pixels = declared_pixels(data)
-    if pixels is None:
+    if not pixels:
         what = (
             "a truncated or damaged JPEG" if data.startswith(_JPEG) else "not a picture that can be decoded"
         )
@@ -282,10 +284,8 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
 
 def asks_to_turn(path: Path) -> bool:
     """Whether a JPEG's EXIF orientation asks to turn or mirror it, which `read_picture` does not."""
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("JPEG",)) as image:
+        with _opened(path, "JPEG") as image:
             return image.getexif().get(0x112, 1) in range(2, 9)
     except Exception:
         # Of another kind, or damaged.

@@ -180,11 +180,8 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
     cells, odd = {}, 0
     for name, number in wanted.items():
         column = table.column(number)
-        values = _floats(column)
-        infinite = np.isinf(values)
-        odd += int(np.count_nonzero(np.isnan(values))) - column.null_count + int(np.count_nonzero(infinite))
-        values[infinite] = np.nan
-        cells[name] = values
+        cells[name] = _floats(column)
+        odd += int(np.count_nonzero(np.isnan(cells[name]))) - column.null_count + _blanked(cells[name])
     return Block(cells, lines, Passed(odd))
 
 
@@ -202,6 +199,13 @@ def _floats(column: Any) -> FloatArray:
     if valid is not None:
         values[np.unpackbits(np.frombuffer(valid, dtype=np.uint8), bitorder="little")[rows] == 0] = np.nan
     return values
+
+
+def _blanked(values: FloatArray) -> int:
+    """How many values were infinite, which are blank from now on."""
+    infinite = np.isinf(values)
+    values[infinite] = np.nan
+    return int(np.count_nonzero(infinite))
 
 
 def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
@@ -226,11 +230,10 @@ def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
             if passed.damaged > spared:
                 raise first from None
     values, lines = values[taken], lines[taken]
-    infinite = np.isinf(values)
-    values[infinite] = np.nan
+    odd = _blanked(values)
     cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
     damage = str(first).removeprefix(f"{text.source}, ").partition(";")[0] if first else ""
-    return Block(cells_of, lines, passed + Passed(int(infinite.sum()), damage=damage))
+    return Block(cells_of, lines, passed + Passed(odd, damage=damage))
 
 
 _SOUND = 200
@@ -536,10 +539,8 @@ def _parquet_blocks(file: Any, columns: ColumnMap) -> Iterator[Block]:
         for batch in file.iter_batches(batch_size=65536, columns=list(read.values())):
             cells, odd = {}, 0
             for name, column in read.items():
-                values = _parquet_column(columns.source, batch.column(column), column).copy()
-                infinite = np.isinf(values)
-                values[infinite] = np.nan
-                cells[name], odd = values, odd + int(infinite.sum())
+                cells[name] = _parquet_column(columns.source, batch.column(column), column).copy()
+                odd += _blanked(cells[name])
             block = Block(cells, np.arange(first, first + len(batch), dtype=np.int64), Passed(odd))
             first += len(batch)
             yield block

@@ -490,7 +490,7 @@ class Live:
         """A frame of a page's camera: a JPEG to look at, or the PNG that was asked for."""
         if tab is not self._camera or self.source is not None:
             return
-        pixels = declared_pixels(data) or 0
+        pixels = declared_pixels(data)
         if not 0 < pixels <= MOST_PIXELS:
             await tab.tell({"type": "fault", "says": f"A frame has no size, or over {MOST_PIXELS} pixels."})
         elif data.startswith(_PNG) and time.monotonic() < tab.shot_until:

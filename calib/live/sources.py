@@ -143,7 +143,7 @@ class Watched:
             frame = None
             try:
                 data = read_bytes(path)
-                pixels = declared_pixels(data) or 0
+                pixels = declared_pixels(data)
                 if pixels > MOST_PIXELS:
                     raise BadInputError(f"{shown(path)}: has more than {MOST_PIXELS // 10**6} million pixels")
                 if pixels > 0:

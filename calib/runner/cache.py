@@ -87,7 +87,8 @@ def held(path: Path, folder: Path, verb: str) -> Iterator[int | None]:
             )
         os.lseek(descriptor, 0, os.SEEK_SET)
         left = os.read(descriptor, 32).split()
-        _tell(descriptor, f"{os.getpid()}\n")
+        with to_be("written", path):
+            _tell(descriptor, f"{os.getpid()}\n")
         yield int(left[0]) if left and left[0].isdigit() else None
         # A run that ends by itself leaves no number.
         with contextlib.suppress(OSError):
@@ -97,12 +98,9 @@ def held(path: Path, folder: Path, verb: str) -> Iterator[int | None]:
 
 
 def _tell(descriptor: int, text: str) -> None:
-    try:
-        os.ftruncate(descriptor, 0)
-        os.lseek(descriptor, 0, os.SEEK_SET)
-        os.write(descriptor, text.encode())
-    except OSError as error:
-        raise BadInputError(f"the lock of calib run cannot be written: {error.strerror or error}") from error
+    os.ftruncate(descriptor, 0)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    os.write(descriptor, text.encode())
 
 
 # ----------------------------------------------------------------------

@@ -33,7 +33,7 @@ from calib.core.rig import Rig
 from calib.core.schema import validated
 from calib.core.units import unit_of
 from calib.core.words import as_words
-from calib.core.workers import Processes, Task
+from calib.core.workers import Processes, Task, at_most
 from calib.core.writing import make_folder
 from calib.io.tables import read_cells
 from calib.runner.cache import key_of, program
@@ -223,18 +223,15 @@ def _from_csv(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tupl
         raise BadInputError(f"{shown(path)}: has the column {one_line(twice)!r} twice")
     rows = zip(cells.lines, cells.rows, strict=True)
     named = ((f"line {line}", dict(zip(head, row, strict=True))) for line, row in rows)
-    return named, tuple(one_line(name) for name in head if name and _strange(name))
+    return named, tuple(one_line(name) for name in head if name and name not in _Row.model_fields)
 
 
 def _from_yaml(path: Path) -> tuple[Iterator[tuple[str, Mapping[str, Any]]], tuple[str, ...]]:
     whole = validated(_Listed, read_yaml_mapping(path), path)
     common = whole.options.model_dump(exclude_unset=True)
     rows = ((f"rig {number}", {**common, **entry}) for number, entry in enumerate(whole.rigs, start=1))
-    return rows, tuple(dict.fromkeys(one_line(key) for entry in whole.rigs for key in entry if _strange(key)))
-
-
-def _strange(column: str) -> bool:
-    return column not in _Row.model_fields
+    strange = (key for entry in whole.rigs for key in entry if key not in _Row.model_fields)
+    return rows, tuple(dict.fromkeys(map(one_line, strange)))
 
 
 def _rig(where: str, row: Mapping[str, Any], root: Path) -> RigSpec:
@@ -267,6 +264,7 @@ def camera_options(options: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 SCHEMES = ("file", "gs", "https", "s3")
 """What may be fetched unasked."""
+ATTEMPTS = 3
 MOST_BYTES = 4_000_000_000
 _MOST_FILES = 20_000
 _PIECE = 1 << 20
@@ -306,13 +304,7 @@ def check_url(url: str, allowed: Allowed) -> None:
         raise BadInputError(f"{told}: its server is in a private network; allow that with --allow-private")
 
 
-def local_folder(
-    source: str,
-    scratch: Path,
-    attempts: int = 3,
-    most_bytes: int = MOST_BYTES,
-    allowed: Allowed = Allowed(),
-) -> Path:
+def local_folder(source: str, scratch: Path, allowed: Allowed = Allowed()) -> Path:
     """The rig's folder: the path itself, or `scratch` with what was fetched.
 
     Raises `BadInputError` for a folder that is not there, cannot be had, or is not to be fetched.
@@ -324,36 +316,29 @@ def local_folder(
             raise BadInputError(f"{shown(root)}: {what}, expected the rig's folder")
         return root
     check_url(source, allowed)
-    return _fetched(source, scratch, attempts, most_bytes)
-
-
-def _fetched(url: str, scratch: Path, attempts: int, most_bytes: int) -> Path:
+    told = without_secrets(source)
     try:
         # Where a server sends one on to was not looked at.
-        words = {"allow_redirects": False} if url.lower().startswith("http") else {}
-        system, root = needed("fsspec.core").url_to_fs(url, **words)
+        words = {"allow_redirects": False} if source.lower().startswith("http") else {}
+        system, place = needed("fsspec.core").url_to_fs(source, **words)
     except ImportError as error:
-        raise BadInputError(
-            f"{without_secrets(url)}: needs a package that is not here: {_words(error)}"
-        ) from error
+        raise BadInputError(f"{told}: needs a package that is not here: {_words(error)}") from error
     except (ValueError, OSError) as error:
-        raise BadInputError(f"{without_secrets(url)}: is no URL that can be read: {_words(error)}") from error
-    told = without_secrets(url)
-    listed = _again(partial(_listed, system, str(root), told), attempts, told)
+        raise BadInputError(f"{told}: is no URL that can be read: {_words(error)}") from error
+    listed = _again(partial(_listed, system, str(place), told), told)
     if not listed:
         raise BadInputError(f"{told}: holds no pictures and no logs")
     total = 0
     for name, remote in listed.items():
-        left = most_bytes - total
         target = scratch / name
         make_folder(target.parent)
-        total += _again(partial(_copied, system, remote, target, left, told), attempts, told)
+        total += _again(partial(_copied, system, remote, target, MOST_BYTES - total, told), told)
     return scratch
 
 
-def _again(work: Callable[[], Any], attempts: int, told: str) -> Any:
+def _again(work: Callable[[], Any], told: str) -> Any:
     """What `work` returns; a fault that may pass is given time to."""
-    for attempt in range(max(1, attempts)):
+    for attempt in range(ATTEMPTS):
         try:
             return work()
         except BadInputError:
@@ -361,7 +346,7 @@ def _again(work: Callable[[], Any], attempts: int, told: str) -> Any:
         except _FINAL as error:
             raise BadInputError(f"{told}: cannot be read: {_words(error)}") from error
         except Exception as error:  # each file system has errors of its own
-            if attempt + 1 >= max(1, attempts):
+            if attempt + 1 >= ATTEMPTS:
                 raise BadInputError(
                     f"{told}: could not be fetched in {attempt + 1} attempts: {_words(error)}"
                 ) from error
@@ -411,7 +396,7 @@ def _copied(system: Any, remote: str, target: Path, most: int, told: str) -> int
         while piece := source.read(_PIECE):
             size += len(piece)
             if size > most:
-                raise BadInputError(f"{told}: is larger than {1e-9 * MOST_BYTES:g} GB, or than was allowed")
+                raise BadInputError(f"{told}: is larger than {1e-9 * MOST_BYTES:g} GB")
             sink.write(piece)
     return size
 
@@ -514,17 +499,8 @@ def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -
     key = key_of(command, inputs, "")
     if known == key:
         return Answer(Outcome(name=spec.name, status=SAME, key=key))
-    import cv2
-
-    from calib.core.workers import at_most
-
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with at_most(1):
-            done = run_stages(folder, kind, spec.options, place / "out", options.pages)
-    finally:
-        cv2.setNumThreads(threads)
+    with at_most(1):
+        done = run_stages(folder, kind, spec.options, place / "out", options.pages)
     files, code = _kept(done.out, done.files, options.pages), _code(done, kind)
     reasons = reasons_of(done.ended)
     decision = done.decision
@@ -761,11 +737,14 @@ def robust_z(x: FloatArray, sigma: FloatArray, spread: Spread) -> FloatArray:
 
 def limit_of(rigs: int, constants: int) -> float:
     """|z| beyond which a rig stands out."""
+    return max(_LEAST_LIMIT, _beyond(_EFFICIENCY * (rigs - 1), rigs * constants))
+
+
+def _beyond(degrees: float, values: int) -> float:
+    """The size of Student's t that one of so many values exceeds with the probability of `_CHANCE`."""
     from scipy.special import stdtrit
 
-    degrees = max(_EFFICIENCY * (rigs - 1), 1.0)
-    tail = 0.5 * _CHANCE / max(rigs * constants, 1)
-    return max(_LEAST_LIMIT, -float(stdtrit(degrees, tail)))
+    return -float(stdtrit(max(degrees, 1.0), 0.5 * _CHANCE / max(values, 1)))
 
 
 # ----------------------------------------------------------------------
@@ -871,9 +850,7 @@ def _covariance(X: FloatArray, r: FloatArray, s: float) -> FloatArray | None:
 
 def drift_limit(rigs: int, constants: int) -> float:
     """|slope| over its sigma beyond which a constant drifts, by chance in 5 % of all fleets."""
-    from scipy.special import stdtrit
-
-    return -float(stdtrit(max(rigs - 2, 1), 0.5 * _CHANCE / max(constants, 1)))
+    return _beyond(rigs - 2, constants)
 
 
 # ----------------------------------------------------------------------

@@ -65,7 +65,7 @@ _MOST_CASES = 200_000
 _LONGEST_S = 3600.0
 _KEY = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)+")
 
-Value = Annotated[float, Field(allow_inf_nan=False, strict=True)] | str | bool
+Value = Number | str | bool
 
 
 class Base(Section):

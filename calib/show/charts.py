@@ -19,25 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from calib.core import plot
 from calib.core.arrays import AnyArray, FloatArray, runs
-from calib.core.plot import (
-    STEEP,
-    Arrows,
-    Band,
-    Bars,
-    Colour,
-    Curve,
-    Field,
-    Figure,
-    Mark,
-    Plot,
-    Ribbon,
-    Rule,
-    Shape,
-    Text,
-    every,
-    thinned,
-)
 from calib.core.writing import make_folder, write_atomically
 
 MOST_POINTS = 400
@@ -61,7 +44,7 @@ def library() -> str:
     return Path(str(found)).read_text(encoding="utf-8")
 
 
-def write_charts(folder: Path, figures: Mapping[str, Figure]) -> None:
+def write_charts(folder: Path, figures: Mapping[str, plot.Figure]) -> None:
     """Write a chart of each figure into a folder, by its name."""
     if figures:
         make_folder(folder)
@@ -70,19 +53,20 @@ def write_charts(folder: Path, figures: Mapping[str, Figure]) -> None:
         write_atomically(folder / f"{name}.json", text)
 
 
-def chart(figure: Figure) -> dict[str, Any]:
+def chart(figure: plot.Figure) -> dict[str, Any]:
     """A figure as a JSON document."""
     arrays = _Arrays()
     cells = _cells(figure)
-    panels = [_Panel(arrays, plot, cell).document() for plot, cell in zip(figure.panels, cells, strict=True)]
-    for k, (plot, cell) in enumerate(zip(figure.panels, cells, strict=True)):
+    placed = list(zip(figure.panels, cells, strict=True))
+    panels = [_Panel(arrays, panel, cell).document() for panel, cell in placed]
+    for k, (panel, cell) in enumerate(placed):
         below = [
             other
             for other, place in enumerate(cells)
             if place[:2] == cell[:2] and place[2] >= cell[3] - 1e-9 and figure.panels[other].x
         ]
         # Panels without a name of x have that of the next one below.
-        panels[k]["follows"] = below[0] if not plot.x and below and not plot.bare else None
+        panels[k]["follows"] = below[0] if not panel.x and below and not panel.bare else None
     return {
         "title": figure.title,
         "note": figure.note,
@@ -122,7 +106,7 @@ def _text(array: FloatArray, kind: str) -> str:
     return base64.b64encode(array.astype(kind).tobytes()).decode("ascii")
 
 
-def _cells(figure: Figure) -> list[tuple[float, float, float, float]]:
+def _cells(figure: plot.Figure) -> list[tuple[float, float, float, float]]:
     """Left, right, top and bottom of each panel as shares of the sheet."""
     letters = np.array([list(row) for row in figure.rows])
     wide = _edges(figure.widths or (1.0,) * letters.shape[1])
@@ -141,7 +125,7 @@ def _words(text: str) -> str:
     return safe.replace("\n", "<br>")
 
 
-def _colour(which: Colour) -> str:
+def _colour(which: plot.Colour) -> str:
     return f"@{which}" if isinstance(which, str) else f"@{which:.3f}"
 
 
@@ -158,83 +142,85 @@ def _placed(what: Mapping[str, Any]) -> bool:
 class _Panel:
     """A panel on its way into a document."""
 
-    def __init__(self, arrays: _Arrays, plot: Plot, cell: tuple[float, float, float, float]) -> None:
-        self._arrays, self._plot, self._cell = arrays, plot, cell
+    def __init__(self, arrays: _Arrays, panel: plot.Plot, cell: tuple[float, float, float, float]) -> None:
+        self._arrays, self._panel, self._cell = arrays, panel, cell
         self._traces: list[dict[str, Any]] = []
         self._shapes: list[dict[str, Any]] = []
         self._notes: list[dict[str, Any]] = []
 
     def document(self) -> dict[str, Any]:
-        plot = self._plot
-        for mark in plot.marks:
+        panel = self._panel
+        for mark in panel.marks:
             self._mark(mark)
-        if plot.corner:
+        if panel.corner:
             corner = {"xref": "x domain", "yref": "y domain", "x": 0.03, "y": 0.03}
-            self._notes.append(corner | {"xanchor": "left", "yanchor": "bottom", "text": _words(plot.corner)})
-        if plot.empty:
-            self._sentence(plot.empty)
+            self._notes.append(
+                corner | {"xanchor": "left", "yanchor": "bottom", "text": _words(panel.corner)}
+            )
+        if panel.empty:
+            self._sentence(panel.empty)
         return {
-            "title": _words(plot.title),
+            "title": _words(panel.title),
             "cell": [round(edge, 5) for edge in self._cell],
             "x": self._axis("x"),
             "y": self._axis("y"),
-            "equal": plot.equal,
-            "bare": plot.bare or bool(plot.empty),
-            "legend": _words(plot.legend_title) if plot.legend else None,
+            "equal": panel.equal,
+            "bare": panel.bare or bool(panel.empty),
+            "legend": _words(panel.legend_title) if panel.legend else None,
             "traces": self._traces,
             "shapes": [one for one in self._shapes if _placed(one)],
             "notes": [one for one in self._notes if _placed(one)],
         }
 
     def _axis(self, name: str) -> dict[str, Any]:
-        plot = self._plot
-        title, limits = (plot.x, plot.x_limits) if name == "x" else (plot.y, plot.y_limits)
-        axis: dict[str, Any] = {"title": {"text": _words(title)}, "showgrid": name in plot.grid}
+        panel = self._panel
+        title, limits = (panel.x, panel.x_limits) if name == "x" else (panel.y, panel.y_limits)
+        axis: dict[str, Any] = {"title": {"text": _words(title)}, "showgrid": name in panel.grid}
         if self._by_asinh(name):
-            least = math.floor(math.log10(plot.linear_within))
+            least = math.floor(math.log10(panel.linear_within))
             tens = [10.0**k for k in range(least, 9)]
             ticks = [*(-ten for ten in reversed(tens)), 0.0, *tens]
             axis |= {
                 "tickvals": self._at(name, np.array(ticks)).tolist(),
                 "ticktext": [f"{t:g}" for t in ticks],
             }
-        elif name in plot.log:
+        elif name in panel.log:
             axis["type"] = "log"
-        if name in plot.whole:
+        if name in panel.whole:
             # Between few values there would be ticks at halves, under the numbers of their neighbours.
             axis |= {"tickformat": "d"} | ({"dtick": 1} if self._span(name) < _FEW else {})
         if limits is not None and np.isfinite(limits).all():
             ends = self._at(name, np.array(limits))
             axis["range"] = _shown(np.log10(ends) if axis.get("type") == "log" else ends)
-        if name == "y" and plot.names:
+        if name == "y" and panel.names:
             axis |= {
-                "tickvals": list(range(len(plot.names))),
-                "ticktext": [_words(one) for one in plot.names],
+                "tickvals": list(range(len(panel.names))),
+                "ticktext": [_words(one) for one in panel.names],
             }
-            axis["range"] = axis.get("range") or [max(len(plot.names), 3) - 0.4, -0.6]
-        elif name == "y" and plot.down:
+            axis["range"] = axis.get("range") or [max(len(panel.names), 3) - 0.4, -0.6]
+        elif name == "y" and panel.down:
             axis |= {"range": axis["range"][::-1]} if "range" in axis else {"autorange": "reversed"}
         return axis
 
     def _span(self, name: str) -> float:
         """Of the values of bars and curves along an axis; bars begin at 0."""
         values = [np.zeros(0)]
-        for mark in self._plot.marks:
-            if isinstance(mark, Curve):
+        for mark in self._panel.marks:
+            if isinstance(mark, plot.Curve):
                 values.append(np.asarray(mark.x if name == "x" else mark.y, dtype=np.float64))
-            elif isinstance(mark, Bars):
+            elif isinstance(mark, plot.Bars):
                 values.append(np.append(mark.length, 0.0) if (name == "x") == mark.across else mark.at)
-        every = np.concatenate(values)
-        every = every[np.isfinite(every)]
-        return float(np.ptp(every)) if len(every) else 0.0
+        along = np.concatenate(values)
+        along = along[np.isfinite(along)]
+        return float(np.ptp(along)) if len(along) else 0.0
 
     def _by_asinh(self, name: str) -> bool:
-        return name in self._plot.log and self._plot.linear_within > 0.0
+        return name in self._panel.log and self._panel.linear_within > 0.0
 
     def _at(self, name: str, values: AnyArray) -> FloatArray:
         """Values where the axis has them; a scale that is linear about zero is that of asinh."""
         out = np.asarray(values, dtype=np.float64)
-        return np.asarray(np.arcsinh(out / self._plot.linear_within)) if self._by_asinh(name) else out
+        return np.asarray(np.arcsinh(out / self._panel.linear_within)) if self._by_asinh(name) else out
 
     def _xy(self, x: AnyArray, y: AnyArray) -> dict[str, Any]:
         ends = (("x", x), ("y", y))
@@ -244,25 +230,25 @@ class _Panel:
         middle = {"xref": "x domain", "yref": "y domain", "x": 0.5, "y": 0.5, "text": _words(words)}
         self._notes.append(middle | {"font": {"color": "@grey"}})
 
-    def _mark(self, mark: Mark) -> None:
+    def _mark(self, mark: plot.Mark) -> None:
         match mark:
-            case Curve():
+            case plot.Curve():
                 self._curve(mark)
-            case Ribbon():
+            case plot.Ribbon():
                 self._ribbon(mark)
-            case Band():
+            case plot.Band():
                 self._band(mark)
-            case Rule():
+            case plot.Rule():
                 self._rule(mark)
-            case Bars():
+            case plot.Bars():
                 self._bars(mark)
-            case Shape():
+            case plot.Shape():
                 self._shape(mark)
-            case Field():
+            case plot.Field():
                 self._field(mark)
-            case Arrows():
+            case plot.Arrows():
                 self._arrows(mark)
-            case Text():
+            case plot.Text():
                 at = {"xref": "x", "yref": "y", "text": f"<b>{_words(mark.words)}</b>" if mark.bold else ""}
                 at["text"] = at["text"] or _words(mark.words)
                 x, y = float(self._at("x", np.array(mark.x))), float(self._at("y", np.array(mark.y)))
@@ -271,9 +257,9 @@ class _Panel:
                 self._notes.append(at | {"x": x, "y": y, "xanchor": mark.align, "font": font})
 
     def _logs(self, name: str) -> bool:
-        return name in self._plot.log and not self._by_asinh(name)
+        return name in self._panel.log and not self._by_asinh(name)
 
-    def _curve(self, curve: Curve) -> None:
+    def _curve(self, curve: plot.Curve) -> None:
         x, y, spread = np.asarray(curve.x), np.asarray(curve.y), curve.spread
         line = curve.kind in _DASHES
         trace: dict[str, Any] = {"type": "scatter", "name": _words(curve.label)}
@@ -282,15 +268,15 @@ class _Panel:
         )
         if line:
             if bool(np.all(x[1:] >= x[:-1])) and spread is None:
-                x, y = thinned(x, y, MOST_POINTS)
+                x, y = plot.thinned(x, y, MOST_POINTS)
             elif spread is None:
-                x, y = every(x, MOST_POINTS), every(y, MOST_POINTS)
+                x, y = plot.every(x, MOST_POINTS), plot.every(y, MOST_POINTS)
             trace |= {"mode": "lines"}
             trace["line"] = {"color": shade, "width": curve.size or 1.4, "dash": _DASHES[curve.kind]}
         else:
-            x, y = every(x, _MOST_DOTS), every(y, _MOST_DOTS)
-            spread = None if spread is None else every(spread, _MOST_DOTS)
-            hue = None if hue is None else every(hue, _MOST_DOTS)
+            x, y = plot.every(x, _MOST_DOTS), plot.every(y, _MOST_DOTS)
+            spread = None if spread is None else plot.every(spread, _MOST_DOTS)
+            hue = None if hue is None else plot.every(hue, _MOST_DOTS)
             size = 1.3 * (curve.size or (2.0 if curve.kind == "cloud" else 4.0))
             marker: dict[str, Any] = {"symbol": _SYMBOLS[curve.kind], "size": size}
             if hue is None:
@@ -306,7 +292,7 @@ class _Panel:
             trace["error_x" if curve.across else "error_y"] = bars
         self._traces.append(trace)
 
-    def _ribbon(self, ribbon: Ribbon) -> None:
+    def _ribbon(self, ribbon: plot.Ribbon) -> None:
         """Down along the lower edge and back along the upper one, stretches of numbers each by itself."""
         x, low, high = ribbon.x, ribbon.low, ribbon.high
         size = -(-len(x) // MOST_POINTS)
@@ -330,7 +316,7 @@ class _Panel:
             self._traces.append(trace | fill | self._xy(*around))
             label = ""
 
-    def _band(self, band: Band) -> None:
+    def _band(self, band: plot.Band) -> None:
         begin, end = self._at(band.axis, np.array([band.begin, band.end])).tolist()
         other = "y" if band.axis == "x" else "x"
         shape = {"type": "rect", f"{band.axis}0": begin, f"{band.axis}1": end, f"{other}0": 0, f"{other}1": 1}
@@ -338,7 +324,7 @@ class _Panel:
         shade = {"fillcolor": _colour(band.colour), "layer": "below", "opacity": 0.6 if band.hatched else 1.0}
         self._shapes.append(shape | shade)
         if band.word:
-            limits = self._plot.x_limits if band.axis == "x" else self._plot.y_limits
+            limits = self._panel.x_limits if band.axis == "x" else self._panel.y_limits
             low, high = (begin, end) if limits is None else self._at(band.axis, np.array(limits)).tolist()
             low, high = sorted((low, high))
             middle = 0.5 * (max(begin, low) + min(end, high))
@@ -349,7 +335,7 @@ class _Panel:
             at |= {"xanchor": "right"} if band.axis == "y" else {"yanchor": "top"}
             self._notes.append(at | {"font": {"color": "@grey"}})
 
-    def _rule(self, rule: Rule) -> None:
+    def _rule(self, rule: plot.Rule) -> None:
         at = float(self._at(rule.axis, np.array(rule.at)))
         other = "y" if rule.axis == "x" else "x"
         shape = {"type": "line", f"{rule.axis}0": at, f"{rule.axis}1": at, f"{other}0": 0, f"{other}1": 1}
@@ -358,7 +344,7 @@ class _Panel:
             shape | {"line": {"color": _colour(rule.colour), "width": 1.2, "dash": _DASHES[rule.kind]}}
         )
 
-    def _bars(self, bars: Bars) -> None:
+    def _bars(self, bars: plot.Bars) -> None:
         hue = bars.colour
         shade: Any = self._arrays(hue) if isinstance(hue, np.ndarray) else _colour(hue)
         marker: dict[str, Any] = {"color": shade}
@@ -369,7 +355,7 @@ class _Panel:
         kind = {"type": "bar", "orientation": "h" if bars.across else "v", "width": bars.width, "name": ""}
         self._traces.append(kind | ends | {"marker": marker})
 
-    def _shape(self, shape: Shape) -> None:
+    def _shape(self, shape: plot.Shape) -> None:
         points = np.vstack([shape.points, shape.points[:1]])
         edge = "rgba(0,0,0,0)" if shape.edge is None else _colour(shape.edge)
         line = {"color": edge, "width": 1.2, "dash": _DASHES[shape.kind]}
@@ -378,7 +364,7 @@ class _Panel:
             trace |= {"fill": "toself", "fillcolor": f"{_colour(shape.fill)}/{shape.opacity:g}"}
         self._traces.append(trace | self._xy(points[:, 0], points[:, 1]))
 
-    def _field(self, field: Field) -> None:
+    def _field(self, field: plot.Field) -> None:
         """A map coloured by its values; by their logarithms where they span decades."""
         step = max(1, math.ceil(math.sqrt(field.values.size / _MOST_CELLS)))
         x, y = (axis[..., ::step] if axis.ndim == 1 else axis[::step, ::step] for axis in (field.x, field.y))
@@ -387,7 +373,7 @@ class _Panel:
             self._sentence(field.nothing or "no value is known here")
             return
         low, high = field.scale or (float(np.nanmin(values)), float(np.nanmax(values)))
-        steep = low > 0.0 and high > STEEP * low and not field.even
+        steep = low > 0.0 and high > plot.STEEP * low and not field.even
         shades = np.log10(values) if steep else values
         ends = (math.log10(low), math.log10(high)) if steep else (low, high)
         colours: dict[str, Any] = {"colorscale": "@rising", "showscale": bool(field.bar)}
@@ -417,7 +403,7 @@ class _Panel:
         dots |= {"hovertemplate": told, "text": "@powers" if steep else "@values"}
         self._traces.append(dots | self._xy(x[known], y[known]))
 
-    def _arrows(self, arrows: Arrows) -> None:
+    def _arrows(self, arrows: plot.Arrows) -> None:
         at, along = arrows.known
         if len(at) == 0:
             return

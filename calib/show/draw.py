@@ -38,25 +38,6 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from calib.core import plot
 from calib.core.arrays import FloatArray
-from calib.core.plot import (
-    STEEP,
-    WIDTH_IN,
-    Arrows,
-    Band,
-    Bars,
-    Colour,
-    Curve,
-    Field,
-    Figure,
-    Mark,
-    Plot,
-    Ribbon,
-    Rule,
-    Shape,
-    Text,
-    rectangle,
-    round_down,
-)
 from calib.core.result import Result
 from calib.core.writing import Kind, begins, make_folder, write_atomically
 
@@ -111,10 +92,10 @@ def look() -> Iterator[None]:
         yield
 
 
-def draw(figure: Figure) -> Drawing:
+def draw(figure: plot.Figure) -> Drawing:
     """A figure drawn by matplotlib: white, title and note above, panels below, labels under them."""
     with look():
-        wide_in = WIDTH_IN - 0.3
+        wide_in = plot.WIDTH_IN - 0.3
         bad = figure.verdict != "ok"
         titles = _lines(plain(figure.title), 13, True, wide_in - bad * _TAG_IN)
         notes = _lines(plain(figure.note), 10, False, wide_in)
@@ -122,8 +103,8 @@ def draw(figure: Figure) -> Drawing:
         high_in = figure.height_in + head_in
         below = (0.008, 0.008, 0.984, 1.0 - head_in / high_in - 0.008)
         layout = ConstrainedLayoutEngine(rect=below, wspace=0.03, hspace=0.03)
-        drawing = Drawing(figsize=(WIDTH_IN, high_in), dpi=_DPI, layout=layout, facecolor="white")
-        left, top = 0.13 / WIDTH_IN, 1.0 - 0.12 / high_in
+        drawing = Drawing(figsize=(plot.WIDTH_IN, high_in), dpi=_DPI, layout=layout, facecolor="white")
+        left, top = 0.13 / plot.WIDTH_IN, 1.0 - 0.12 / high_in
         drawing.text(left, top, "\n".join(titles), fontsize=13, weight="bold", va="top", linespacing=1.3)
         top -= (_TITLE_IN * len(titles) + 0.04) / high_in
         drawing.text(left, top, "\n".join(notes), color=_GREY, va="top", linespacing=1.3)
@@ -159,7 +140,7 @@ def plots(result: Result) -> dict[str, Drawing]:
 FIGURE = Kind("a figure", (".png",), begins(b"\x89PNG"))
 
 
-def save(figure: Figure, path: Path) -> Path:
+def save(figure: plot.Figure, path: Path) -> Path:
     """Write a figure as PNG, atomically and without dates: the same figure gives the same bytes."""
     canvas: Any = FigureCanvasAgg(draw(figure))
     buffer = io.BytesIO()
@@ -169,7 +150,7 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def write_figures(folder: Path, figures: Mapping[str, Figure]) -> list[Path]:
+def write_figures(folder: Path, figures: Mapping[str, plot.Figure]) -> list[Path]:
     """Draw figures into files of their names in a folder, which is made if needed; the files written.
 
     Raises `BadInputError` where the folder or a file cannot be written.
@@ -182,7 +163,7 @@ def write_figures(folder: Path, figures: Mapping[str, Figure]) -> list[Path]:
 # Panels.
 
 
-def _places(drawing: Drawing, figure: Figure) -> list[Axes]:
+def _places(drawing: Drawing, figure: plot.Figure) -> list[Axes]:
     """Axes for each panel, in the figure's order."""
     placed = drawing.subplot_mosaic(
         "\n".join(figure.rows), width_ratios=figure.widths or None, height_ratios=figure.heights or None
@@ -190,7 +171,7 @@ def _places(drawing: Drawing, figure: Figure) -> list[Axes]:
     return [placed[name] for name in sorted(placed)]
 
 
-def _panel(axes: Axes, panel: Plot) -> None:
+def _panel(axes: Axes, panel: plot.Plot) -> None:
     """Scales and limits first, for some marks are placed by them."""
     axes.set_title(plain(panel.title))
     axes.set_xlabel(plain(panel.x))
@@ -288,7 +269,7 @@ def _legend(drawing: Drawing, panels: list[Axes]) -> None:
     if not handles:
         return
     widest_in = max(_width_pt(label, 9.0, False) for label in handles) / 72.0 + 0.55
-    most = max(1, min(7, int((WIDTH_IN - 0.3) / widest_in)))
+    most = max(1, min(7, int((plot.WIDTH_IN - 0.3) / widest_in)))
     below = drawing.legend(
         handles.values(), handles, loc="outside lower center", ncols=min(most, len(handles)), handlelength=1.6
     )
@@ -306,43 +287,43 @@ _MARKERS = {
 }  # fmt: skip
 
 
-def colour(which: Colour) -> Any:
+def colour(which: plot.Colour) -> Any:
     """A hue by its name, or a shade from dark violet to green, never as light as the paper."""
     return HUES[which] if isinstance(which, str) else mpl.colormaps["viridis"](0.86 * which)
 
 
-def _colours(which: Colour | FloatArray) -> Any:
+def _colours(which: plot.Colour | FloatArray) -> Any:
     return [colour(float(one)) for one in which] if isinstance(which, np.ndarray) else colour(which)
 
 
-def _mark(axes: Axes, mark: Mark, z: float) -> None:
+def _mark(axes: Axes, mark: plot.Mark, z: float) -> None:
     match mark:
-        case Curve():
+        case plot.Curve():
             _curve(axes, mark, z)
-        case Ribbon():
+        case plot.Ribbon():
             axes.fill_between(
                 mark.x, mark.low, mark.high, color=colour(mark.colour), linewidth=0.0,
                 label=plain(mark.label) or None, zorder=1.0,
             )  # fmt: skip
-        case Band():
+        case plot.Band():
             _band(axes, mark)
-        case Rule():
+        case plot.Rule():
             line = axes.axvline if mark.axis == "x" else axes.axhline
             strong = 0.8 if mark.colour in ("grey", "ink") and mark.kind == "line" else 1.4
             line(mark.at, color=colour(mark.colour), linestyle=_STYLES[mark.kind], linewidth=strong, zorder=z)
-        case Bars():
+        case plot.Bars():
             shade: Any = {"color": _colours(mark.colour), "edgecolor": "white", "linewidth": 0.5, "zorder": z}
             if mark.across:
                 axes.barh(mark.at, mark.length, height=mark.width, **shade)
             else:
                 axes.bar(mark.at, mark.length, width=mark.width, **shade)
-        case Shape():
+        case plot.Shape():
             _shape(axes, mark, z)
-        case Field():
+        case plot.Field():
             _field(axes, mark)
-        case Arrows():
+        case plot.Arrows():
             _arrows(axes, mark, z)
-        case Text():
+        case plot.Text():
             axes.text(
                 mark.x, mark.y, plain(mark.words), color=colour(mark.colour), ha=mark.align, va="center",
                 fontsize=9.0, weight="bold" if mark.bold else "normal", zorder=z,
@@ -350,7 +331,7 @@ def _mark(axes: Axes, mark: Mark, z: float) -> None:
             )  # fmt: skip
 
 
-def _curve(axes: Axes, curve: Curve, z: float) -> None:
+def _curve(axes: Axes, curve: plot.Curve, z: float) -> None:
     label = plain(curve.label) or None
     if curve.kind in _STYLES:
         style: Any = {"linestyle": _STYLES[curve.kind], "linewidth": curve.size or 1.3}
@@ -382,7 +363,7 @@ def _curve(axes: Axes, curve: Curve, z: float) -> None:
     )  # fmt: skip
 
 
-def _band(axes: Axes, band: Band) -> None:
+def _band(axes: Axes, band: plot.Band) -> None:
     hatch, edge = _HATCHES[band.colour] if band.hatched else (None, "none")
     fill: Any = {"facecolor": colour(band.colour), "edgecolor": edge, "hatch": hatch, "linewidth": 0.0}
     span = axes.axvspan if band.axis == "x" else axes.axhspan
@@ -397,7 +378,7 @@ def _band(axes: Axes, band: Band) -> None:
         axes.text(s=plain(band.word), va="center", color=_GREY, **place)
 
 
-def _shape(axes: Axes, shape: Shape, z: float) -> None:
+def _shape(axes: Axes, shape: plot.Shape, z: float) -> None:
     hatch, edge = None, "none" if shape.edge is None else colour(shape.edge)
     if shape.hatched:
         hatch, edge = _HATCHES[shape.fill]
@@ -409,7 +390,7 @@ def _shape(axes: Axes, shape: Shape, z: float) -> None:
     axes.add_patch(outline)
 
 
-def _arrows(axes: Axes, arrows: Arrows, z: float) -> None:
+def _arrows(axes: Axes, arrows: plot.Arrows, z: float) -> None:
     """Arrows, and above the upper right corner, level with the title, one of a round length."""
     at, vectors = arrows.known
     if len(at) == 0:
@@ -423,7 +404,7 @@ def _arrows(axes: Axes, arrows: Arrows, z: float) -> None:
     wide, high = _size_in(axes)
     # Above a narrow panel there is no room beside the title, which tells how long the arrows are.
     if arrows.unit and longest > 0.0 and wide > 0.7 * high:
-        length = round_down(1.3 * longest)
+        length = plot.round_down(1.3 * longest)
         left, right = sorted(axes.get_xlim())
         start = 1.0 - length * arrows.times / (right - left)
         axes.quiverkey(
@@ -435,14 +416,14 @@ def _arrows(axes: Axes, arrows: Arrows, z: float) -> None:
 # Maps.
 
 
-def _field(axes: Axes, field: Field) -> None:
+def _field(axes: Axes, field: plot.Field) -> None:
     """Filled contours with their values on the lines, hatched where unknown; a sentence if there are none."""
     known = field.known
     finite = known[np.isfinite(known)]
     x, y = field.x, field.y
     if len(finite) < known.size:
-        whole = rectangle(float(x.min()), float(y.min()), float(np.ptp(x)), float(np.ptp(y)))
-        _shape(axes, Shape(whole, "shade", hatched=True), 0.4)
+        whole = plot.rectangle(float(x.min()), float(y.min()), float(np.ptp(x)), float(np.ptp(y)))
+        _shape(axes, plot.Shape(whole, "shade", hatched=True), 0.4)
     if field.nothing:
         flat = np.where(np.isfinite(known), 0.25, np.nan)
         axes.pcolormesh(x, y, flat, cmap=_RISING, vmin=0.0, vmax=1.0, zorder=1.0)
@@ -452,7 +433,7 @@ def _field(axes: Axes, field: Field) -> None:
     norm: Normalize = BoundaryNorm(levels, _RISING.N)
     if field.scale is not None:
         low, high = field.scale
-        norm = LogNorm(low, high) if 0.0 < low < high / STEEP else Normalize(0.0, high)
+        norm = LogNorm(low, high) if 0.0 < low < high / plot.STEEP else Normalize(0.0, high)
         levels = np.unique(np.maximum(levels, 0.5 * low)) if isinstance(norm, LogNorm) else levels
     filled = axes.contourf(x, y, known, levels=levels, cmap=_RISING, norm=norm, zorder=1.0)
     inside = levels[(levels > finite.min()) & (levels < finite.max())]
@@ -471,7 +452,7 @@ def contour_levels(values: FloatArray, *, even: bool = False) -> FloatArray:
     """Round levels that enclose all finite values: by 1-2-5 where these span decades, else evenly spaced."""
     finite = values[np.isfinite(values)]
     low, high = float(finite.min()), float(finite.max())
-    if low > 0.0 and high > STEEP * low and not even:
+    if low > 0.0 and high > plot.STEEP * low and not even:
         first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
         steps = ("1", "2", "5") if high / low < 3e3 else ("1",)
         # One decade more on both sides: logarithms of round numbers may be off by their last digit.

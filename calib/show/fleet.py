@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from calib.core import __version__
-from calib.core.plot import Bars, Curve, Figure, Mark, Plot, Rule
+from calib.core.plot import SIGMA, Bars, Curve, Figure, Mark, Plot, Rule
 from calib.core.units import unit_of
 from calib.core.verdict import POOR
-from calib.core.words import BLANK, SIGMA, as_words, counted, number, several
+from calib.core.words import BLANK, as_words, counted, number, several
 from calib.core.writing import write_atomically
 from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
 from calib.runner.graph import STEPS

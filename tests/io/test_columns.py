@@ -356,7 +356,7 @@ def test_a_gyroscope_at_rest_that_may_be_either_is_not_guessed(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("gz_radsp: gz\n", "gz_radsp is not known, did you mean gz_radps"),
+        ("gz_radsp: gz\n", "gz_radsp is not known; did you mean gz_radps"),
         ("gz_radps: {column: gz, unit: m}\n", "gz_radps.unit is 'm', expected one of rad/s, deg/s"),
         ("gz_radps: {col: gz}\n", "expected a column's name or column, unit, factor, offset"),
         ("gz_radps: {column: gz, factor: much}\n", "gz_radps.factor is 'much', expected a number"),

@@ -240,7 +240,7 @@ UNKNOWN = {
 def test_a_file_whose_size_is_not_known_is_not_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    assert declared_pixels(UNKNOWN[name]) is None
+    assert declared_pixels(UNKNOWN[name]) == 0
     (tmp_path / "a.png").write_bytes(UNKNOWN[name])
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
     with pytest.raises(BadInputError, match=r"not a picture that can be decoded|JPEG"):
@@ -251,4 +251,4 @@ def test_a_file_whose_size_is_not_known_is_not_decoded(
 @given(st.sampled_from([b"", b"\xff\xd8", b"II*\0", b"MM\0+", b"BM", b"RIFF    WEBP", b"P5 "]), st.binary())
 def test_any_bytes_have_a_size_or_none(start: bytes, rest: bytes) -> None:
     found = declared_pixels(start + rest)
-    assert found is None or found > 0
+    assert found >= 0

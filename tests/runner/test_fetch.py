@@ -40,17 +40,18 @@ def test_what_belongs_to_a_rig_is_fetched_and_no_more(memory: Any, tmp_path: Pat
         memory.pipe(f"/rig/{name}", name.encode())
     for name in ("images/run.sh", "secret/key.csv", "images/deep/er/b.png"):
         memory.pipe(f"/rig/{name}", b"no")
-    root = local_folder("memory://rig", tmp_path / "here", 1, allowed=ANY)
+    root = local_folder("memory://rig", tmp_path / "here", ANY)
     found = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
     assert found == {"images/a.png", "images/board.yaml", "images/plane/p.jpg", "logs/x.csv", "rig.yaml"}
     assert (root / "logs/x.csv").read_bytes() == b"logs/x.csv"
 
 
-def test_what_is_too_large_is_refused(memory: Any, tmp_path: Path) -> None:
+def test_what_is_too_large_is_refused(memory: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetch, "MOST_BYTES", 1000)
     memory.pipe("/rig/images/a.png", b"x" * 600)
     memory.pipe("/rig/images/b.png", b"x" * 600)
     with pytest.raises(BadInputError, match="larger than"):
-        local_folder("memory://rig", tmp_path / "here", 1, 1000, ANY)
+        local_folder("memory://rig", tmp_path / "here", ANY)
 
 
 @pytest.mark.parametrize("name", ["a/../../evil.png", "a\\..\\..\\evil.png", "/etc/evil.png"])
@@ -67,7 +68,7 @@ def test_names_that_lead_out_stay_in(name: str, tmp_path: Path, monkeypatch: pyt
 
     (tmp_path / "source").write_bytes(b"x")
     monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url, **_: (System(), "/rig"))
-    root = local_folder("ftp://host/rig", tmp_path / "deep" / "er" / "here", 1, allowed=ANY)
+    root = local_folder("ftp://host/rig", tmp_path / "deep" / "er" / "here", ANY)
     assert list(tmp_path.rglob("evil.png")) == [root / "images" / "evil.png"]
 
 
@@ -81,7 +82,7 @@ def test_names_that_are_no_names_are_refused(
 
     monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url, **_: (System(), "/rig"))
     with pytest.raises(BadInputError, match="has a file with the name"):
-        local_folder("ftp://host/rig", tmp_path / "here", 1, allowed=ANY)
+        local_folder("ftp://host/rig", tmp_path / "here", ANY)
 
 
 class _Flaky:
@@ -110,7 +111,7 @@ def test_what_may_pass_is_tried_again(
     system = _Flaky(failures, error)
     monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url, **_: (system, "/rig"))
     with pytest.raises(BadInputError, match=said) as told:
-        local_folder("ftp://me:secret@host/rig?key=1", tmp_path / "here", 3, allowed=ANY)
+        local_folder("ftp://me:secret@host/rig?key=1", tmp_path / "here", ANY)
     # Two failed attempts and four folders with nothing in them; the first one is asked again each time.
     assert system.calls == calls - (error.args == ("slow",))
     assert "secret" not in str(told.value) and "key" not in str(told.value)
@@ -148,7 +149,7 @@ def test_what_is_not_to_be_fetched_is_not_asked_for(
 
     monkeypatch.setattr(fsspec.core, "url_to_fs", never)
     with pytest.raises(BadInputError, match=re.escape(said)):
-        local_folder(url, tmp_path, 1)
+        local_folder(url, tmp_path)
 
 
 def test_what_a_person_allows_is_fetched_and_no_further(tmp_path: Path) -> None:
@@ -176,11 +177,11 @@ def test_what_a_person_allows_is_fetched_and_no_further(tmp_path: Path) -> None:
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         base, allowed = f"http://127.0.0.1:{server.server_port}", Allowed(("http",), private=True)
-        root = local_folder(f"{base}/rig", tmp_path / "a", 1, allowed=allowed)
+        root = local_folder(f"{base}/rig", tmp_path / "a", allowed)
         assert (root / "logs" / "x.csv").read_bytes() == b"t_s\n0\n"
         asked.clear()
         with pytest.raises(BadInputError):
-            local_folder(f"{base}/elsewhere", tmp_path / "b", 1, allowed=allowed)
+            local_folder(f"{base}/elsewhere", tmp_path / "b", allowed)
         assert asked and all(path.startswith("/elsewhere") for path in asked)
     finally:
         server.shutdown()

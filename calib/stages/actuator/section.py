@@ -16,14 +16,15 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from calib.core.files import one_line
 from calib.core.result import CovarianceTable, NotNegative, Number, Pair, Result, Section, Statement, quantity
-from calib.core.schema import nearest, validated
+from calib.core.schema import validated
+from calib.core.words import nearest
 
 if TYPE_CHECKING:
     from calib.stages.actuator.parameters import Plant
 
-Acceleration = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False, strict=True)]
-Factor = Annotated[float, Field(ge=0.0, le=10.0, allow_inf_nan=False, strict=True)]
-Millimetres = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False, strict=True)]
+Acceleration = Annotated[Number, Field(ge=-100.0, le=100.0)]
+Factor = Annotated[Number, Field(ge=0.0, le=10.0)]
+Millimetres = Annotated[Number, Field(ge=-1e4, le=1e4)]
 Deviations = dict[str, NotNegative | list[NotNegative | None] | None]
 """Standard deviations by key, a list where the value is one; null where nothing bounds it."""
 

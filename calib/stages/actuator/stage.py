@@ -623,6 +623,5 @@ validate = Stage(
     leaves_out=True,
     uses=(*logs.uses, "arm"),
     document=_validate_document,
-    words=_validate_words,
     plots=later("calib.stages.actuator.plots", "validate_plots"),
 )

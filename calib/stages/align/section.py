@@ -7,16 +7,17 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from calib.core.files import quoted
-from calib.core.result import Count, CovarianceTable, NotNegative, Result, Section, quantity
-from calib.core.schema import contradiction, nearest
+from calib.core.result import Count, CovarianceTable, NotNegative, Number, Result, Section, quantity
+from calib.core.schema import contradiction
+from calib.core.words import nearest
 
-Angle = Annotated[float, Field(ge=-7.0, le=7.0, allow_inf_nan=False, strict=True)]
-Seconds = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
-Metres = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=True)]
-Share = Annotated[float, Field(ge=-0.5, le=0.5, allow_inf_nan=False, strict=True)]
-Rate = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False, strict=True)]
-Bias = Annotated[float, Field(ge=-5.0, le=5.0, allow_inf_nan=False, strict=True)]
-Noise = Annotated[float, Field(ge=0.0, le=1e3, allow_inf_nan=False, strict=True)]
+Angle = Annotated[Number, Field(ge=-7.0, le=7.0)]
+Seconds = Annotated[Number, Field(ge=-10.0, le=10.0)]
+Metres = Annotated[Number, Field(ge=-1.0, le=1.0)]
+Share = Annotated[Number, Field(ge=-0.5, le=0.5)]
+Rate = Annotated[Number, Field(ge=-1.0, le=1.0)]
+Bias = Annotated[Number, Field(ge=-5.0, le=5.0)]
+Noise = Annotated[Number, Field(ge=0.0, le=1e3)]
 SharePair = Annotated[list[Share], Field(min_length=2, max_length=2)]
 MetresPair = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
@@ -103,7 +104,7 @@ class Align(Result):
         label="accel noise", digits=4
     )
     gyro_noise_radps: Noise = quantity(label="gyro noise", digits=4)
-    imu_age_s: Annotated[float, Field(gt=0.0, le=0.1, allow_inf_nan=False, strict=True)] | None = quantity(
+    imu_age_s: Annotated[Number, Field(gt=0.0, le=0.1)] | None = quantity(
         None, label="times of the IMU's readings", show="ms", digits=2
     )
     logs: list[LogCheck] = quantity([], label="log")

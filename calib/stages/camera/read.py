@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError, CalibError, UsageError
 from calib.core.files import PICTURES, check_readable, hash_of, one_line, read_yaml_mapping, shown, to_be
+from calib.core.result import Number, Pair
 from calib.core.schema import validated
 from calib.core.units import plain_number
 from calib.core.words import several
@@ -43,13 +44,11 @@ from calib.stages.camera.verdict import Limits
 # board.yaml, and the search for its board in a set of pictures.
 
 Count = Annotated[int, Field(ge=3, le=200, strict=True)]
-Metres = Annotated[float, Field(ge=1e-5, lt=10, allow_inf_nan=False, strict=True)]
-Place = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Metres = Annotated[Number, Field(ge=1e-5, lt=10)]
+Place = Annotated[Number, Field(ge=-1e3, le=1e3)]
 Position = Annotated[list[Place], Field(min_length=2, max_length=2)]
-Pixel = Annotated[list[Number], Field(min_length=2, max_length=2)]
-Angle = Annotated[float, Field(ge=-6.2832, le=6.2832, allow_inf_nan=False, strict=True)]
-Spread = Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False, strict=True)]
+Angle = Annotated[Number, Field(ge=-6.2832, le=6.2832)]
+Spread = Annotated[Number, Field(ge=0.0, le=0.1)]
 
 BOARD_FILE = "board.yaml"
 _SIZE_SAMPLE = 5
@@ -76,7 +75,7 @@ class BoardFile(BaseModel):
     angle_rad: Angle | None = None
     first_corner_sigma_m: Spread = 0.0
     angle_sigma_rad: Spread = 0.0
-    first_corner_px: Pixel | None = None
+    first_corner_px: Pair | None = None
     simulated: bool = False
 
 

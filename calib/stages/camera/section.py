@@ -19,7 +19,8 @@ from calib.core.result import (
     Sigma,
     quantity,
 )
-from calib.core.schema import contradiction, nearest
+from calib.core.schema import contradiction
+from calib.core.words import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,10 +31,10 @@ if TYPE_CHECKING:
     from calib.stages.camera import model as optics
 
 Model = Annotated[str, Field(pattern="^(pinhole|radial2|radial3|fisheye4|brown5|rational8)$")]
-Focal = Annotated[float, Field(ge=1e-3, le=1e7, allow_inf_nan=False, strict=True)]
-Pixels = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
-Coefficient = Annotated[float, Field(ge=-1e30, le=1e30, allow_inf_nan=False, strict=True)]
-Metres = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
+Focal = Annotated[Number, Field(ge=1e-3, le=1e7)]
+Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
+Coefficient = Annotated[Number, Field(ge=-1e30, le=1e30)]
+Metres = Annotated[Number, Field(ge=-1e3, le=1e3)]
 Side = Annotated[int, Field(ge=1, le=100_000, strict=True)]
 
 

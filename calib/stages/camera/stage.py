@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from calib.core.arrays import FloatArray
-    from calib.core.plot import Figure
     from calib.core.rig import Rig
     from calib.core.verdict import Finding
     from calib.core.words import Block
@@ -175,12 +174,6 @@ def _camera_words(camera: Camera) -> list[Block]:
     return blocks
 
 
-def _camera_plots(camera: Camera) -> dict[str, Figure]:
-    from calib.stages.camera.plots import plots
-
-    return plots(camera.evidence)
-
-
 intrinsics = Stage(
     "intrinsics",
     "Camera",
@@ -198,7 +191,7 @@ intrinsics = Stage(
     writes=("camera",),
     document=_camera_document,
     words=_camera_words,
-    plots=_camera_plots,
+    plots=lambda camera: later("calib.stages.camera.plots", "plots")(camera.evidence),
     remarks=lambda rig: rig.outdated(),
 )
 
@@ -378,12 +371,6 @@ def _plane_words(result: Plane) -> list[Block]:
     ]
 
 
-def _plane_plots(result: Plane) -> dict[str, Figure]:
-    from calib.stages.camera.plots import plane_plots
-
-    return plane_plots(result.evidence.camera, result.evidence.fit)
-
-
 extrinsics = Stage(
     "extrinsics",
     "Plane of motion",
@@ -403,7 +390,9 @@ extrinsics = Stage(
     needs=("camera",),
     document=lambda plane: {"not_used": _not_used(plane.evidence.left_out)},
     words=_plane_words,
-    plots=_plane_plots,
+    plots=lambda plane: later("calib.stages.camera.plots", "plane_plots")(
+        plane.evidence.camera, plane.evidence.fit
+    ),
     remarks=lambda rig: rig.outdated(),
 )
 

@@ -246,7 +246,6 @@ run = Stage(
     several=False,
     uses=("camera", "plane", "lowpass", "actuator", "pump", "controller", "twin"),
     document=_run_document,
-    words=_run_words,
     plots=later("calib.stages.control.plots", "run_plots"),
 )
 
@@ -395,7 +394,6 @@ check = Stage(
         kind=("calib.stages.control.read", "REFERENCE"),
     ),
     document=_check_document,
-    words=_check_words,
     plots=later("calib.stages.control.plots", "check_plots"),
 )
 

@@ -15,11 +15,11 @@ from calib.core.words import BLANK, Block, Table
 if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
 
-Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False, strict=True)]
-Gain = Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)]
+Positive = Annotated[Number, Field(gt=0, le=1e9)]
+NotNegative = Annotated[Number, Field(ge=0, le=1e9)]
+Gain = Annotated[Number, Field(gt=0, lt=1)]
 # The length of a late and precise picture is corrected by more than its residual, which its rate shares.
-LateGain = Annotated[float, Field(gt=0, lt=2, allow_inf_nan=False, strict=True)]
+LateGain = Annotated[Number, Field(gt=0, lt=2)]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class EstimatorGain:
     __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
 
     rate_hz: Positive
-    delay_ticks: Annotated[float, Field(ge=0, le=8, allow_inf_nan=False, strict=True)]
+    delay_ticks: Annotated[Number, Field(ge=0, le=8)]
     lever_m: Positive
     camera_phi: Gain
     accel_phi: Gain

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from calib.core.result import Section
+from calib.core.result import Number, Section
 
-_Length = Annotated[float, Field(gt=0, lt=10, allow_inf_nan=False, strict=True)]
+_Length = Annotated[Number, Field(gt=0, lt=10)]
 
 
 class Envelope(Section):
@@ -18,23 +18,23 @@ class Envelope(Section):
     greatest_length_m: _Length | None = None
     """Lengths of a bellows. Default: from 20 mm below the rest length to 50 mm above."""
 
-    angle_rad: Annotated[float, Field(gt=0, le=1.5, allow_inf_nan=False, strict=True)] | None = None
+    angle_rad: Annotated[Number, Field(gt=0, le=1.5)] | None = None
     """Bending to each side. Default: what one bellows bends alone that is 50 mm longer."""
 
-    rate_mps: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False, strict=True)] = 0.5
+    rate_mps: Annotated[Number, Field(gt=0, le=10)] = 0.5
     """Rate of a length."""
 
-    full_power_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, strict=True)] = 3.0
+    full_power_s: Annotated[Number, Field(gt=0, le=600)] = 3.0
     """Time that a pump may stay at its greatest command. Default: 3, or four lags of a slower pump."""
 
-    open_loop_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, strict=True)] = 60.0
+    open_loop_s: Annotated[Number, Field(gt=0, le=600)] = 60.0
     """Time that a pump may be on in open loop, less four times what it was off."""
 
-    open_loop_pwm: Annotated[float, Field(ge=1, le=255, allow_inf_nan=False, strict=True)] | None = None
+    open_loop_pwm: Annotated[Number, Field(ge=1, le=255)] | None = None
     """Greatest command in open loop. Default: what holds the greatest length by the pump's map, at
     most controller.pwm_high."""
 
-    apart_m: Annotated[float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True)] = 0.012
+    apart_m: Annotated[Number, Field(gt=0, lt=1)] = 0.012
     """Distance of the marker from where the angle puts it."""
 
     @model_validator(mode="after")

@@ -105,5 +105,4 @@ firmware = Stage(
         "Folder to write into.", _write, default=Path("firmware_constants"), folder=True
     ),
     document=_document,
-    words=lambda outcome: outcome.blocks(),
 )  # fmt: skip

@@ -23,11 +23,11 @@ from calib.core.result import (
 # ----------------------------------------------------------------------
 # The section `imu` of rig.yaml.
 
-Rate = Annotated[float, Field(ge=-10.0, le=10.0, allow_inf_nan=False, strict=True)]
+Rate = Annotated[Number, Field(ge=-10.0, le=10.0)]
 Rates = Annotated[list[Rate | None], Field(min_length=3, max_length=3)]
-Force = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False, strict=True)]
+Force = Annotated[Number, Field(ge=-1e3, le=1e3)]
 Forces = Annotated[list[Force | None], Field(min_length=3, max_length=3)]
-Small = Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False, strict=True)]
+Small = Annotated[Number, Field(ge=0, le=1e3)]
 Noises = Annotated[list[Small | None], Field(min_length=3, max_length=3)]
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from calib.io.logs import Log
     from calib.stages.imu.mahony import AngleFilter
     from calib.stages.imu.sampling import Readings
-    from calib.stages.imu.section import Drift, Imu, OrientationFilter
+    from calib.stages.imu.section import Drift, Imu
     from calib.stages.imu.tuning import TuneLog
 
 
@@ -55,14 +55,6 @@ def _write_kalibr(files: Files, imu: Imu) -> list[Path]:
     return [files.output]
 
 
-def _static_words(imu: Imu) -> list[Block]:
-    del imu
-    return [
-        Line("± is one standard deviation, < a 95 % bound where the logs are too short for an estimate"),
-        Line("accel mean holds gravity: one pose does not tell it from a bias"),
-    ]
-
-
 static = Stage(
     "imu static",
     "IMU at rest",
@@ -83,7 +75,10 @@ static = Stage(
         ("--imu-yaml",),
         kind=("calib.stages.imu.formats", "IMU_YAML"),
     ),
-    words=_static_words,
+    words=lambda imu: [
+        Line("± is one standard deviation, < a 95 % bound where the logs are too short for an estimate"),
+        Line("accel mean holds gravity: one pose does not tell it from a bias"),
+    ],
     plots=later("calib.stages.imu.plots", "static_plots"),
 )
 
@@ -195,14 +190,6 @@ def _read_tune(files: Files, rig: Rig, options: TuneOptions) -> tuple[Any, ...]:
     return logs, *sensor_noise(rig, logs), how.tilted
 
 
-def _tune_words(section: OrientationFilter) -> list[Block]:
-    del section
-    return [
-        Line("noise: variance of the angle over that of the accelerometer's; peak: angle per rate's bias"),
-        Line("each part of the logs is judged with gains of the others"),
-    ]
-
-
 tune = Stage(
     "imu tune",
     "Angle filter",
@@ -220,7 +207,10 @@ tune = Stage(
     leaves_out=True,
     writes=("orientation_filter",),
     uses=("imu", "imu_intrinsics", "camera", "plane"),
-    words=_tune_words,
+    words=lambda section: [
+        Line("noise: variance of the angle over that of the accelerometer's; peak: angle per rate's bias"),
+        Line("each part of the logs is judged with gains of the others"),
+    ],
     plots=later("calib.stages.imu.plots", "tune_plots"),
 )
 
