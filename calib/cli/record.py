@@ -259,9 +259,7 @@ def _ticks(
             logs.append((path, appending(path, LOG)))
             if number:
                 narrate(f"the board restarted; from there on the log is {shown(path)}")
-        stream = logs[number][1]
-        stream.write(text.encode())
-        stream.flush()
+        _writer(logs[number][1])(text)
 
     try:
         with line.line:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,11 +12,6 @@ from calib.cli.verbs import of_logs
 from calib.core.files import shown
 from calib.core.options import NOTHING_STATED, LogOptions
 from calib.core.verdict import LEADS
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from calib.runner.graph import Job
 
 _SHOWN = 3
 """Sentences on what to record next, for a terminal."""
@@ -67,7 +62,9 @@ def run(
     if as_json:
         document("run", {"run": done.told, "decision": decision.as_json(), "files": [*done.files]})
     else:
-        _tell(done.ended, done.files, output)
+        rows = [[job.label, job.status, "as before" if job.reused else ""] for job in done.ended]
+        say_table(["stage", "", ""], rows)
+        say(f"{shown(output)}: report.html and {len(done.files) - 1} more files")
         say(f"can it be flashed? {decision.answer}: {decision.headline}")
         for sentence in decision.weak:
             say(f"{LEADS['reason']}{sentence}")
@@ -77,9 +74,3 @@ def run(
     narrate(f"page written to {output / 'report.html'}")
     if decision.exit_code:
         raise typer.Exit(decision.exit_code)
-
-
-def _tell(ended: Sequence[Job], files: Sequence[str], output: Path) -> None:
-    rows = [[job.label, job.status, "as before" if job.reused else ""] for job in ended]
-    say_table(["stage", "", ""], rows)
-    say(f"{shown(output)}: report.html and {len(files) - 1} more files")

@@ -1,4 +1,4 @@
-"""The homography from a plane to pixels, fitted without knowing the camera.
+"""Rotations, boxes, and the homography from a plane to pixels, fitted without knowing the camera.
 
     s (u, v, 1) = H (X, Y, 1)
 
@@ -48,6 +48,22 @@ def box_grid(box: Sequence[float] | FloatArray, columns: int, rows: int) -> Floa
 def in_picture(pixels: FloatArray, image_size_px: tuple[int, int]) -> BoolArray:
     """Whether pixels (..., 2) are known and lie in a picture of this width and height, edges included."""
     return np.asarray(((pixels >= -0.5) & (pixels <= np.array(image_size_px) - 0.5)).all(axis=-1))
+
+
+def cross_matrices(v: FloatArray) -> FloatArray:
+    """Matrices (N, 3, 3) with [v]x w = v x w."""
+    S = np.zeros((len(v), 3, 3))
+    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return S - S.transpose(0, 2, 1)
+
+
+def rotation_exp(delta: FloatArray) -> FloatArray:
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3) (Rodrigues), smooth at zero."""
+    angle = np.linalg.norm(delta, axis=1)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    S = cross_matrices(delta)
+    return np.asarray(np.eye(3) + a[:, None, None] * S + b[:, None, None] * (S @ S))
 
 
 def apply_homography(H: FloatArray, points: FloatArray) -> FloatArray:

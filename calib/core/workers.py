@@ -181,11 +181,7 @@ class Pool:
     """
 
     def __init__(
-        self,
-        count: int,
-        retries: int = 0,
-        begin: Callable[[bool], None] | None = None,
-        forked: bool = False,
+        self, count: int, retries: int = 0, begin: Callable[[bool], None] | None = None, forked: bool = False
     ) -> None:
         self._count, self._retries, self._begin, self._forked = max(1, count), retries, begin, forked
         self._idle: list[tuple[Connection, BaseProcess]] = []

@@ -39,6 +39,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, IntArray, blocks, rms
 from calib.core.errors import BadInputError
 from calib.core.files import one_line, quoted, read_yaml_mapping, shown
+from calib.core.geometry import rotation_exp
 from calib.core.options import LogOptions
 from calib.core.units import GRAVITY_MPS2
 from calib.core.words import nearest, several
@@ -839,19 +840,12 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
         steps = np.concatenate([np.zeros((1, 3)), rates[1:] * np.diff(t_s)[:, None]])
         turn3 = np.diff(np.add.reduceat(np.cumsum(steps, axis=0), edges, axis=0)[: len(edges)] / size, axis=0)
         turned = np.linalg.norm(np.diff(means3, axis=0), axis=1)
-        misfit = {f: np.linalg.norm(means3[1:] - _turned(means3[:-1], -f * turn3), axis=1) for f in factors}
+        predicted = {f: (rotation_exp(-f * turn3) @ means3[:-1, :, None])[:, :, 0] for f in factors}
+        misfit = {f: np.linalg.norm(means3[1:] - one, axis=1) for f, one in predicted.items()}
     whole = rms(turned) if len(turned) else 0.0
     share = {f: rms(off) / whole if whole > 0.0 else 1.0 for f, off in misfit.items()}
     spread = float(phi.std()) if flat else float(np.linalg.norm(unit.std(axis=0)))
     return Turning(flat, by_force, by_gyro, spread, share, whole)
-
-
-def _turned(u: FloatArray, by: FloatArray) -> FloatArray:
-    """Vectors (n, 3) turned by rotation vectors (n, 3), Rodrigues' formula."""
-    angle = np.linalg.norm(by, axis=1, keepdims=True)
-    k = by / np.maximum(angle, 1e-12)
-    along = (k * u).sum(axis=1, keepdims=True)
-    return np.asarray(u * np.cos(angle) + np.cross(k, u) * np.sin(angle) + k * along * (1.0 - np.cos(angle)))
 
 
 def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:

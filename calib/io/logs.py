@@ -122,11 +122,12 @@ class Log(InWords):
         """Write as .csv or .parquet; never over a recording. Raises `BadInputError`."""
         write_log(Path(path), self, SIMULATED if set(TRUE) & set(self.columns) else LOG)
 
-    def sampled(self, *names: str) -> IntArray:
-        """Indices of the rows in which all these columns have a value; none where one is missing."""
+    def sampled(self, *names: str, partly: bool = False) -> IntArray:
+        """Indices of the rows in which all these columns have a value, or any; none where one is missing."""
         if not names or any(name not in self.columns for name in names):
             return np.zeros(0, dtype=np.int64)
-        return np.nonzero(np.logical_and.reduce([~np.isnan(self.columns[name]) for name in names]))[0]
+        of = np.logical_or if partly else np.logical_and
+        return np.nonzero(of.reduce([~np.isnan(self.columns[name]) for name in names]))[0]
 
     @property
     def beginning(self) -> dict[str, FloatArray]:
@@ -171,7 +172,7 @@ class Log(InWords):
         check_time(self)
         apart = None if partly else _apart(self, wanted)
         log = self if apart is None else apart
-        rows = log.sampled(*wanted) if not partly else _any(log, wanted)
+        rows = log.sampled(*wanted, partly=partly)
         if len(rows) == 0:
             raise BadInputError(
                 f"{log.source}: no row has all of {', '.join(wanted)}, expected them together"
@@ -757,10 +758,6 @@ def _apart(log: Log, names: Sequence[str]) -> Log | None:
         columns[name] = np.full(len(log), np.nan)
         columns[name][at] = np.where(known, np.interp(wanted, t, log.columns[name][of]), np.nan)
     return replace(log, columns=columns)
-
-
-def _any(log: Log, names: Sequence[str]) -> IntArray:
-    return np.nonzero(np.logical_or.reduce([np.isfinite(log.columns[name]) for name in names]))[0]
 
 
 @dataclass

@@ -25,15 +25,7 @@ from calib.core.files import one_line, read_bytes, read_text, shown
 from calib.core.options import LogOptions
 from calib.core.units import plain_number
 from calib.core.words import several
-from calib.io.columns import (
-    Block,
-    ColumnMap,
-    ColumnsFile,
-    Passed,
-    column_map,
-    columns_file,
-    known_name,
-)
+from calib.io.columns import Block, ColumnMap, ColumnsFile, Passed, column_map, columns_file, known_name
 
 _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16

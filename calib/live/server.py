@@ -359,7 +359,8 @@ class Live:
                 if says is not None:
                     await self.tell_all({**_seen(Seen(None, "hold", says)), "answer": True})
             except CalibError as error:
-                await self.tell_all({"type": "fault", "says": _sentence(error)})
+                says = str(error)
+                await self.tell_all({"type": "fault", "says": says[:1].upper() + says[1:]})
             await self.tell_all(await asyncio.to_thread(self.state))
         else:
             await tab.tell({"type": "fault", "says": "The page asked for what this version does not know."})
@@ -391,11 +392,9 @@ class Live:
             raise BadInputError("no board is connected: start calib live with --port, as --port /dev/ttyUSB0")
         if step == "plane" and self.rig.camera is None:
             raise BadInputError("the camera comes first: take its pictures")
-        self._held(self._set, step)
-
-    def _set(self, step: str) -> None:
-        self.marker.stop()
-        self.step = step
+        with self._lock:
+            self.marker.stop()
+            self.step = step
 
     def _point(self, asked: dict[str, Any]) -> None:
         at = asked.get("at")
@@ -686,11 +685,6 @@ def _with_headers(send: Send) -> Send:
         await send(message)
 
     return sends
-
-
-def _sentence(error: CalibError) -> str:
-    text = str(error)
-    return text[:1].upper() + text[1:]
 
 
 def _seen(seen: Seen) -> dict[str, Any]:

@@ -342,8 +342,10 @@ def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     """
     # The same noise for a draw wherever it is in the grid: differences are then those of the parameters.
     noise = 100_003 * seed + case.draw
-    changed, options = _changed(case)
-    known = Rig.of(_known(base.rig, changed), _HERE)
+    options = {key.removeprefix("scenario."): one for key, one in case.values if key.startswith("scenario.")}
+    changed = {key: one for key, one in case.values if not key.startswith("scenario.")}
+    told = {key: one for key, one in changed.items() if key.partition(".")[0] not in _PLANT}
+    known = Rig.of(_document(base.rig, told), _HERE)
     plant = rig_from_file(Rig.of(_document(base.rig, changed), _HERE))
     if base.kind == "controller":
         return _controlled(base, known, plant, noise)
@@ -354,18 +356,6 @@ def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     if base.kind == "scenario":
         return dict(plan.figures(run))
     return _filtered(base, known, run)
-
-
-def _changed(case: Case) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Changes to rig.yaml by their paths, and options of the scenario."""
-    changed, options = dict[str, Any](), dict[str, Any]()
-    for key, value in case.values:
-        section, _, rest = key.partition(".")
-        if section == "scenario":
-            options[rest] = value
-        else:
-            changed[key] = value
-    return changed, options
 
 
 @lru_cache(maxsize=4)
@@ -388,12 +378,6 @@ def _document(text: str, changed: Mapping[str, Any]) -> dict[str, Any]:
                 raise BadInputError(f"{key}: {name} is no section of the rig's file")
         part[last] = value
     return whole
-
-
-def _known(text: str, changed: Mapping[str, Any]) -> dict[str, Any]:
-    """What controllers and filters are told: the base rig, and their own parameters."""
-    own = {key: value for key, value in changed.items() if key.partition(".")[0] not in _PLANT}
-    return _document(text, own)
 
 
 def _controlled(base: Base, known: Rig, plant: SimulatedRig, seed: int) -> dict[str, float | None]:

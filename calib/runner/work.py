@@ -17,14 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core.command import one_command
-from calib.core.errors import (
-    EXIT_DONE,
-    EXIT_INTERNAL,
-    EXIT_POOR,
-    NoSectionError,
-    SomeFailedError,
-    end_of,
-)
+from calib.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_POOR, NoSectionError, SomeFailedError, end_of
 from calib.core.files import one_line, shown
 from calib.core.options import options_of
 from calib.core.rig import SECTIONS, Rig

@@ -18,10 +18,7 @@ from calib.core.writing import Kind, holds
 from calib.stages.camera.model import Board
 from calib.stages.camera.targets import dictionary_of
 
-PAGES_MM: dict[str, tuple[float, float]] = {
-    "A4": (210.0, 297.0),
-    "Letter": (215.9, 279.4),
-}
+PAGES_MM: dict[str, tuple[float, float]] = {"A4": (210.0, 297.0), "Letter": (215.9, 279.4)}
 """Width and height of a page held upright, millimetres."""
 
 _POINTS_PER_MM = 72.0 / 25.4

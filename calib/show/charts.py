@@ -129,11 +129,6 @@ def _colour(which: plot.Colour) -> str:
     return f"@{which}" if isinstance(which, str) else f"@{which:.3f}"
 
 
-def _shown(values: Any) -> Any:
-    """Limits as JSON has them."""
-    return None if values is None else [float(value) for value in values]
-
-
 def _placed(what: Mapping[str, Any]) -> bool:
     """Whether a shape or a note has a place that is a number."""
     return all(math.isfinite(value) for value in what.values() if isinstance(value, float))
@@ -191,7 +186,7 @@ class _Panel:
             axis |= {"tickformat": "d"} | ({"dtick": 1} if self._span(name) < _FEW else {})
         if limits is not None and np.isfinite(limits).all():
             ends = self._at(name, np.array(limits))
-            axis["range"] = _shown(np.log10(ends) if axis.get("type") == "log" else ends)
+            axis["range"] = (np.log10(ends) if axis.get("type") == "log" else ends).tolist()
         if name == "y" and panel.names:
             axis |= {
                 "tickvals": list(range(len(panel.names))),

@@ -17,7 +17,7 @@ from calib.core.words import number
 from calib.core.writing import write_atomically
 from calib.show.page import PAGE, embedded, render
 from calib.stages.camera.lens import far_difference_px, ideal_pixels, projection_sigma_px
-from calib.stages.camera.plots import panel_height_in, picture
+from calib.stages.camera.plots import grid_over, panel_height_in, picture
 from calib.stages.camera.section import Camera
 
 _ACROSS = 33
@@ -83,9 +83,7 @@ def _over_picture(before: Camera, after: Camera) -> Figure:
     if before.image_size_px != after.image_size_px:
         why = f"{size[0]}x{size[1]} and {after.image_size_px[0]}x{after.image_size_px[1]} px"
         return Figure(title, f"The pictures differ in size: {why}.", (Plot(empty=why),), 1.5)
-    down = max(3, round(_ACROSS * size[1] / size[0]))
-    u, v = np.linspace(0.0, size[0] - 1.0, _ACROSS), np.linspace(0.0, size[1] - 1.0, down)
-    grid = np.stack(np.meshgrid(u, v), axis=-1)
+    u, v, grid = grid_over(size, _ACROSS)
     apart = far_difference_px(before.optics, after.optics, grid.reshape(-1, 2)).reshape(grid.shape)
     sigmas = [_sigma_px(one, grid) for one in (before, after)]
     both = None if sigmas[0] is None or sigmas[1] is None else np.hypot(sigmas[0], sigmas[1])

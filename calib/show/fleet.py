@@ -15,7 +15,7 @@ from calib.core.units import unit_of
 from calib.core.verdict import POOR
 from calib.core.words import BLANK, as_words, counted, number, several
 from calib.core.writing import write_atomically
-from calib.runner.fleet import ConstantSummary, Drift, FleetSummary
+from calib.runner.fleet import ConstantSummary, FleetSummary
 from calib.runner.graph import STEPS
 from calib.runner.sweep import Point, Sweep, SweepSummary
 from calib.show.page import PAGE as A_PAGE
@@ -66,13 +66,10 @@ def constant_figure(one: ConstantSummary) -> Figure:
         word = (
             "It drifts with the serial number" if one.drifts else "It has no drift that is more than chance"
         )
-        sentence += f" {word}: {_with_sigma(drift)}{unit} per number, over {counted(drift.count, 'rig')}."
+        slope, bar = number(drift.slope, drift.sigma), number(drift.sigma, drift.sigma)
+        sentence += f" {word}: {slope} ± {bar}{unit} per number, over {counted(drift.count, 'rig')}."
         sentence += "" if near.all() else " Crosses are farther away than drawn."
     return Figure(f"{name} over {counted(one.spread.count, 'rig')}", sentence, panels, 2.2 * len(panels))
-
-
-def _with_sigma(drift: Drift) -> str:
-    return f"{number(drift.slope, drift.sigma)} ± {number(drift.sigma, drift.sigma)}"
 
 
 # ----------------------------------------------------------------------

@@ -305,13 +305,7 @@ def _stages(told: Mapping[str, Any], rig: Rig, hidden: Path, budget: _Budget) ->
     return [made[name] for name in grouped]
 
 
-def _stage(
-    name: str,
-    jobs: list[dict[str, Any]],
-    rig: Rig,
-    hidden: Path,
-    budget: _Budget,
-) -> dict[str, Any]:
+def _stage(name: str, jobs: list[dict[str, Any]], rig: Rig, hidden: Path, budget: _Budget) -> dict[str, Any]:
     names = dict.fromkeys(str(name) for job in jobs for name in job["writes"])
     sections = [rig.sections[name] for name in names if name in rig.sections]
     verdict = Verdict.of(

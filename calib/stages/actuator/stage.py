@@ -149,9 +149,8 @@ def _words(sections: Sections) -> list[Block]:
     if found.decrements:
         peaks = []
         for name, (d, of_fit) in found.decrements.items():
-            fitted = BLANK if of_fit is None else f"{of_fit:.4f}"
-            cells = (f"{d.zeta:.4f}", f"{d.sigma:.1g}", fitted, f"{d.frequency_hz:.3f}", str(d.outliers))
-            peaks.append((name, *cells))
+            zeta, fitted = f"{d.zeta:.4f}", number(of_fit, places=4)
+            peaks.append((name, zeta, f"{d.sigma:.1g}", fitted, f"{d.frequency_hz:.3f}", str(d.outliers)))
         columns = ("damping of", "zeta by peaks", "sigma", "of the fit", "f, Hz", "outliers")
         blocks.append(Table(columns, tuple(peaks)))
     if found.prospects:

@@ -82,13 +82,7 @@ def read_trials(
     """
     from calib.core.units import parse_mass_kg
     from calib.io.logs import read_log
-    from calib.stages.arm.read import (
-        check_frame,
-        frame_findings,
-        frame_of,
-        recording_of,
-        trial_of,
-    )
+    from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
 
     names = [path.stem for path in files.named]
     if len(set(names)) < len(names):
@@ -256,8 +250,7 @@ def _untold(found: Identification) -> Iterator[Finding]:
         takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
     if untold:
         yield Finding(
-            "remark",
-            f"{', '.join(untold)}: the prior's, these logs do not tell; it takes {', '.join(takes)}",
+            "remark", f"{', '.join(untold)}: the prior's, these logs do not tell; it takes {', '.join(takes)}"
         )
     if "load" not in found.fit.assembly.parts:
         yield Finding(
@@ -269,7 +262,7 @@ def _untold(found: Identification) -> Iterator[Finding]:
 
 def _words(arm: Arm) -> list[Block]:
     """Parameters with what identifies them, and one table of errors on trials held back."""
-    from calib.core.words import BLANK, Line, Table
+    from calib.core.words import BLANK, Line, Table, number
     from calib.stages.arm.identify import QUANTITIES, mean_of
     from calib.stages.arm.model import PARTS
 
@@ -296,16 +289,13 @@ def _words(arm: Arm) -> list[Block]:
         ahead.append((kind, ", ".join(f"{name} to {100.0 * left[name]:.0f} %" for name in most)))
     blocks.append(Table(("one more trial, twice", "lowers deviations most"), tuple(ahead)))
 
-    def cell(error: float) -> str:
-        return BLANK if math.isnan(error) else f"{error:.2f}"
-
     for name, of in QUANTITIES.items():
         if math.isfinite(mean_of(found.held, name)):
             table = [
                 (
                     model,
-                    *(cell(of.scale * one[name]) for one in errors.values()),
-                    cell(of.scale * mean_of(errors, name)),
+                    *(number(of.scale * one[name], places=2) for one in errors.values()),
+                    number(of.scale * mean_of(errors, name), places=2),
                 )
                 for model, errors in found.models.items()
             ]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
-from calib.core.geometry import linear_homographies
+from calib.core.geometry import cross_matrices, linear_homographies, rotation_exp
 from calib.stages.camera.model import (
     FISHEYE,
     INTRINSICS,
@@ -59,22 +59,6 @@ _CHUNK = 80_000
 """Jacobian entries of a chunk of views, halved: about 1.3 MB."""
 _TUNING = {"huber": 1.345, "cauchy": 2.385}
 """95 % efficiency on Gaussian residuals."""
-
-
-def cross_matrices(v: FloatArray) -> FloatArray:
-    """Matrices (N, 3, 3) with [v]x w = v x w."""
-    S = np.zeros((len(v), 3, 3))
-    S[:, 0, 1], S[:, 0, 2], S[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return S - S.transpose(0, 2, 1)
-
-
-def rotation_exp(delta: FloatArray) -> FloatArray:
-    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3) (Rodrigues), smooth at zero."""
-    angle = np.linalg.norm(delta, axis=1)
-    a = np.sinc(angle / np.pi)
-    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    S = cross_matrices(delta)
-    return np.asarray(np.eye(3) + a[:, None, None] * S + b[:, None, None] * (S @ S))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
-from calib.core.geometry import box_grid
+from calib.core.geometry import box_grid, rotation_exp
 from calib.solve.information import scaled_inverse
 from calib.stages.camera import bundle, model
 
@@ -1268,7 +1268,7 @@ def tilted(tilt_deg: float, away: str) -> FloatArray:
     """Rotation (3, 3) of a board whose edge `away` in the picture leans away from the camera."""
     azimuth = np.radians(_EDGES.get(away, 0.0))
     axis = np.array([[np.sin(azimuth), -np.cos(azimuth), 0.0]])
-    return np.asarray(bundle.rotation_exp(np.radians(tilt_deg) * axis)[0])
+    return np.asarray(rotation_exp(np.radians(tilt_deg) * axis)[0])
 
 
 def best_next_view(calibration: bundle.Calibration, information: FloatArray) -> Plan | None:

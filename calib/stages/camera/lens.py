@@ -10,9 +10,9 @@ import numpy as np
 
 from calib.core.arrays import AnyArray, BoolArray, FloatArray
 from calib.core.errors import BadInputError
-from calib.core.geometry import apply_homography, box_grid, fit_homography
+from calib.core.geometry import apply_homography, box_grid, fit_homography, rotation_exp
 from calib.core.result import finite_or_none
-from calib.stages.camera.bundle import Covariance, rotation_exp
+from calib.stages.camera.bundle import Covariance
 from calib.stages.camera.model import (
     INTRINSICS,
     Camera,

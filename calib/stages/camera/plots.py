@@ -87,7 +87,7 @@ def picture(size: Size, marks: Sequence[plot.Mark], title: str = "", empty: str 
     return plot.Plot("u (px)", "v (px)", inside, title, u, v, grid="", equal=True, down=True, empty=empty)
 
 
-def _grid_over(size: Size, across: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def grid_over(size: Size, across: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Coordinates (columns,), (rows,) and pixels (rows, columns, 2), the cells about square."""
     down = int(np.clip(round(across * size[1] / size[0]), 3, 3 * across))
     pixels = box_grid((0.0, 0.0, size[0] - 1.0, size[1] - 1.0), across, down)
@@ -335,7 +335,7 @@ def _radii(camera: Camera, pixels: FloatArray) -> plot.Plot:
 def _projection_sigma(fit: Calibration, sigma: Covariance) -> plot.Figure:
     """Standard deviation of projection over the picture, with the hull of what was seen."""
     size = fit.camera.image_size_px
-    u, v, pixels = _grid_over(size, 97)
+    u, v, pixels = grid_over(size, 97)
     values = projection_sigma_px(fit, sigma, pixels.reshape(-1, 2)).reshape(len(v), len(u))
     # What moves by more than the picture's size is not known at all.
     values[values > math.hypot(*size)] = np.inf
@@ -434,10 +434,10 @@ def _map(camera: Camera, marks: tuple[plot.Mark, ...]) -> plot.Plot:
         return picture(size, (), empty="not bounded")
     if camera.ideal:
         return picture(size, marks, empty="no distortion: every point is seen where an ideal lens shows it")
-    u, v, pixels = _grid_over(size, 81)
+    u, v, pixels = grid_over(size, 81)
     length = np.linalg.norm(displacement_field(camera, pixels), axis=-1)
     field = plot.Field(u, v, np.where(shown_once(camera, pixels), length, np.nan), "px", even=True)
-    u, _, pixels = _grid_over(size, 15)
+    u, _, pixels = grid_over(size, 15)
     at = pixels[1:-1, 1:-1].reshape(-1, 2)
     at = at[shown_once(camera, at)]
     vectors = displacement_field(camera, at)

@@ -14,7 +14,7 @@ from calib.core.options import option
 from calib.core.stage import Files, Output, Stage, later
 from calib.core.units import parse_angle_rad, parse_duration_s, parse_pwm_limits
 from calib.core.verdict import Finding, Verdict
-from calib.core.words import BLANK, Block, InWords, Line, Table, of_verdict
+from calib.core.words import Block, InWords, Line, Table, number, of_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -202,9 +202,6 @@ def _run_document(runs: Runs) -> dict[str, Any]:
 
 
 def _run_words(runs: Runs) -> list[Block]:
-    def cell(value: float | None, digits: int) -> str:
-        return BLANK if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
     reference, rows = runs.reference, []
     if reference.kind == "lengths":
         head = ["rms q1 mm", "rms q2 mm", "rms head mm", "largest mm", "rms rad"]
@@ -213,12 +210,13 @@ def _run_words(runs: Runs) -> list[Block]:
         head += ["after jump", "settle s"] if reference.jump_s is not None else []
     for one in runs.outcomes:
         f = one.figures
+        told: list[tuple[float | None, int]] = [(f.angle_rms_rad, 4)]
         if reference.kind == "lengths":
-            row = [cell(v, 3) for v in (*f.rms_mm, f.head_rms_mm, f.largest_mm)] + [cell(f.angle_rms_rad, 4)]
+            told = [*((v, 3) for v in (*f.rms_mm, f.head_rms_mm, f.largest_mm)), *told]
         else:
-            row = [cell(f.angle_rms_rad, 4), cell(f.largest_rad, 4), cell(f.rise_s, 2), cell(f.reach_s, 2)]
-            row += [cell(f.overshoot_rad, 4), cell(f.settling_s, 2)]
-            row += [cell(f.jump_overshoot_rad, 4), cell(f.jump_settling_s, 2)]
+            told += [(f.largest_rad, 4), (f.rise_s, 2), (f.reach_s, 2), (f.overshoot_rad, 4)]
+            told += [(f.settling_s, 2), (f.jump_overshoot_rad, 4), (f.jump_settling_s, 2)]
+        row = [number(value, places=places) for value, places in told]
         saturated = " ".join(f"{share:.0%}" for share in f.saturation)
         rows.append((one.controller, *row[: len(head)], saturated, f"{f.changes_pwm:.1f}"))
     rate_hz = 1.0 / runs.model.tick_s

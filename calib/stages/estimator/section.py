@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, PrivateAttr
 
 from calib.core.errors import BadInputError, package
 from calib.core.result import Count, Number, Result, Section, Sigma, quantity
-from calib.core.words import BLANK, Block, Table
+from calib.core.words import Block, Table, number
 
 if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
@@ -236,7 +236,7 @@ class Replayed(Result):
 
         def cells(name: str, errors: Errors) -> tuple[str, ...]:
             shown = ((errors.get(key), places) for key, (_, places) in _ERRORS.items())
-            return (name, *(BLANK if value is None else f"{value:.{places}f}" for value, places in shown))
+            return (name, *(number(value, places=places) for value, places in shown))
 
         head = ("RMSE after 2 s", *(label for label, _ in _ERRORS.values()))
         rows = [cells("this", self.rmse), *(cells(name, errors) for name, errors in self.compared.items())]

@@ -32,8 +32,7 @@ class ReplayOptions(LogOptions):
         "library, to check the equations.",
     )
     model: Literal["auto", "kinematic", "driven"] = option(
-        "auto",
-        "Driven by the commands in the log, kinematic, or (auto) whichever explains the log better.",
+        "auto", "Driven by the commands in the log, kinematic, or (auto) whichever explains the log better."
     )
     smooth: bool = option(False, "Look at the whole log, forward and backward.")
     tune: bool = option(False, "Learn the noise from these logs; written to the rig's file.")

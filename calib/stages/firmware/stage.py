@@ -69,11 +69,7 @@ def _document(outcome: Header | Check) -> dict[str, Any]:
     from calib.stages.firmware.header import Header
 
     verdict = outcome.verdict
-    judged = {
-        "gate": verdict.reasons or "passed",
-        "remarks": verdict.remarks,
-        "advice": verdict.advice,
-    }
+    judged = {"gate": verdict.reasons or "passed", "remarks": verdict.remarks, "advice": verdict.advice}
     if isinstance(outcome, Header):
         return {"constants": len(outcome.literals), **judged}
     return {
