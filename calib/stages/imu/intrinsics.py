@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtrc
 
-from calib.core.arrays import FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.core.result import finite_or_none, judged
@@ -20,6 +20,7 @@ from calib.core.verdict import Finding, Verdict
 from calib.solve.clock import Part
 from calib.stages.imu.levelling import turned
 from calib.stages.imu.sampling import (
+    INSET_S,
     MULTIPLES,
     Quiet,
     Readings,
@@ -110,6 +111,9 @@ ANGLES = {2: ("yz",), 3: ("yz", "zy", "zx")}
 
 LEAST_SPAN = 0.02
 """Smallest singular value below which parameters are not told apart."""
+
+_SQUARE_RAD = 0.01
+"""Deviation of an accelerometer's axes from right angles: data sheets allow 1 to 2 % of cross-axis share."""
 
 _ROUNDS = 6
 
@@ -318,7 +322,7 @@ def fit_accelerometer(rests: Sequence[Rest], gravity_mps2: float, si: bool) -> A
     """
     x = np.stack([rest.mean for rest in rests])
     n, d = x.shape
-    count = np.array([rest.samples for rest in rests], dtype=np.float64)
+    count = np.array([rest.samples - 2 * rest.inset for rest in rests], dtype=np.float64)
     # The noise is the sensor's: one rest tells little of it, all together much.
     scatter = np.median(np.stack([rest.scatter for rest in rests]), axis=0)
     variance = scatter / count[:, None]
@@ -344,8 +348,12 @@ def fit_accelerometer(rests: Sequence[Rest], gravity_mps2: float, si: bool) -> A
     if span > 1e-6:
         units = _units(p, d, g)[free]
         W = J[:, free] * units / deviation[:, None]
-        covariance[np.ix_(free, free)] = np.outer(units, units) * np.linalg.inv(W.T @ W) * scale2
-        sigma[free] = np.sqrt(np.diag(covariance)[free])
+        inverse = np.linalg.inv(W.T @ W)
+        # Angles that are taken to be zero turn what they leave of the residuals into bias and scale.
+        shift = inverse @ W.T @ (J[:, len(free) :] / deviation[:, None]) * _SQUARE_RAD
+        known = np.outer(units, units) * (inverse * scale2 + shift @ shift.T)
+        covariance[np.ix_(free, free)] = known
+        sigma[free] = np.sqrt(np.diag(known))
     across = np.sqrt((variance / p[d : 2 * d] ** 2).mean(axis=1) + tau**2) / g
     return Accelerometer(
         bias=p[:d],
@@ -389,7 +397,8 @@ class Turns:
     first, last : (k,) last reading of the rest before and first of the rest after.
     before : (k,) numbers of the rests before, rising; those after follow them.
     rests : all of them.
-    gyro_mean, gyro_scatter : (m, 3) mean over each rest, and long-run variance of a reading.
+    gyro_mean, gyro_scatter : (m, 3) mean over the middle of each rest, and long-run variance of a reading.
+    gyro_count : (m,) readings of each mean.
     rounded : (3,) deviation of a mean by the rounding of the rates.
     initial : number of the rest that the bias is taken from.
     """
@@ -402,6 +411,7 @@ class Turns:
     rests: Sequence[Rest]
     gyro_mean: FloatArray
     gyro_scatter: FloatArray
+    gyro_count: FloatArray
     rounded: FloatArray
     initial: int
     period_s: float
@@ -536,6 +546,8 @@ _FASTEST_RADPS, _SLOWEST_RADPS = 50.0, 0.2
 _FINE, _COARSE = 1.05, 1.3
 _FOLLOWS_POSE = 1e-4
 _LEAST_FALL = 0.7
+_TURNS = 6.0
+"""Times the usual deviation of the rests' mean rates, from which on one turns about the vertical."""
 _ASTRAY_RAD = 0.2
 _LEAST_SPAN = 1e-3
 
@@ -596,14 +608,21 @@ def _matrix(p: FloatArray) -> FloatArray:
     return misalignment(tuple(PLACES), p[3:], 3) / p[:3]
 
 
+def _unturned(gyro_mean: FloatArray, rounded: FloatArray) -> BoolArray:
+    """Which rests (m,) do not turn about the vertical, by their mean rates (m, 3) with what rounding does."""
+    off = np.abs(gyro_mean - np.median(gyro_mean, axis=0))
+    usual = np.maximum(1.4826 * np.median(off, axis=0), rounded)
+    return np.asarray((off <= _TURNS * usual).all(axis=1))
+
+
 def fit_bias(turns: Turns, accel: Accelerometer) -> Bias:
     """What the gyroscope reads at rest, by pose where that shows."""
-    x, d = turns.gyro_mean, len(accel.bias)
+    d, still = len(accel.bias), _unturned(turns.gyro_mean, turns.rounded)
+    noise = np.median(turns.gyro_scatter, axis=0)
+    x, white = turns.gyro_mean[still], noise / turns.gyro_count[still, None]
     n = len(x)
-    length = np.array([rest.samples for rest in turns.rests], dtype=np.float64)
-    white = np.median(turns.gyro_scatter, axis=0) / length[:, None]
     active = np.flatnonzero(white.any(axis=0))
-    f = rest_forces(turns, accel.parameters)
+    f = rest_forces(turns, accel.parameters)[still]
     H = np.hstack([np.ones((n, 1)), f])
     dof = n - d - 1
     about = ((x - x.mean(axis=0)) ** 2).sum(axis=0)
@@ -622,8 +641,8 @@ def fit_bias(turns: Turns, accel: Accelerometer) -> Bias:
     # Noise alone exceeds its expectation by chance, too.
     clear = excess > 3.0 * math.sqrt(2.0 / max(n - 1, 1)) * white.mean(axis=0)
     wander = np.asarray(np.sqrt(np.where(clear, excess, 0.0)))
-    sigma = np.sqrt(white[turns.initial] + wander**2 + turns.rounded**2)
-    return Bias(x[turns.initial], sigma, None, None, wander)
+    sigma = np.sqrt(noise / turns.gyro_count[turns.initial] + wander**2 + turns.rounded**2)
+    return Bias(turns.gyro_mean[turns.initial], sigma, None, None, wander)
 
 
 def _rates(turns: Turns, accel: Accelerometer, bias: Bias) -> FloatArray:
@@ -867,18 +886,27 @@ def _turns(
     gyro[:, 3 - len(names) :] = values[:, log.places(*names)]
     offsets = np.cumsum([0, *(len(part.values) for part in parts)]).tolist()
     longest = max(2, round(_LONGEST_FILLED_S / period_s))
+
+    def inside_by(rest: Rest) -> int:
+        return min(rest.samples // 2, round(INSET_S / period_s))
+
     spans = []
     for i, (a, b) in enumerate(itertools.pairwise(rests)):
         places = parts[a.part].places
         inside = places[(places >= a.stop - 1) & (places <= b.start)]
         if a.part == b.part and len(inside) >= 2 and int(np.diff(inside).max()) <= longest:
-            spans.append((offsets[a.part] + a.stop - 1, offsets[a.part] + b.start, i))
+            spans.append(
+                (offsets[a.part] + a.stop - 1 - inside_by(a), offsets[a.part] + b.start + inside_by(b), i)
+            )
     first, last, before = np.array(spans, dtype=np.int64).reshape(-1, 3).T.copy()
-    held = [gyro[offsets[rest.part] + rest.start : offsets[rest.part] + rest.stop] for rest in rests]
+    held = [gyro[offsets[rest.part] :][rest.middle] for rest in rests]
     # By differences, which a slow drift does not enter.
     scatter = np.stack([0.5 * (np.diff(one, axis=0) ** 2).mean(axis=0) for one in held])
     steps = np.zeros(3)
     steps[3 - len(names) :] = step[log.places(*names)]
+    mean = np.stack([one.mean(axis=0) for one in held])
+    rounded = rounding(np.median(scatter, axis=0), steps)
+    long = [rest.duration_s for rest in rests] * _unturned(mean, rounded)
     turns = Turns(
         gyro=gyro,
         accel=values[:, columns],
@@ -886,10 +914,11 @@ def _turns(
         last=last,
         before=before,
         rests=rests,
-        gyro_mean=np.stack([one.mean(axis=0) for one in held]),
+        gyro_mean=mean,
         gyro_scatter=scatter,
-        rounded=rounding(np.median(scatter, axis=0), steps),
-        initial=0 if quiet.initial_s > 0.0 else int(np.argmax([rest.duration_s for rest in rests])),
+        gyro_count=np.array([len(one) for one in held], dtype=np.float64),
+        rounded=rounded,
+        initial=0 if quiet.initial_s > 0.0 else int(np.argmax(long)),
         period_s=period_s,
     )
     return turns, len(rests) - 1 - len(spans)
@@ -977,8 +1006,6 @@ def find_intrinsics(log: Readings, gravity_mps2: float, planar: bool = False) ->
 LIMITS = {"scale": 0.005, "bias_g": 0.005, "angle_rad": math.radians(0.5), "gyro": 0.01}
 """Largest standard deviations: relative scale, bias in g, misalignment, and those of the gyroscope."""
 
-_SQUARE_RAD = 0.01
-"""Deviation of an accelerometer's axes from right angles: data sheets allow 1 to 2 % of cross-axis share."""
 _USELESS = 20.0
 _NEAR = 0.5
 _LARGEST_RMS_G = 0.01
@@ -1126,6 +1153,13 @@ def _of_gyroscope(result: Intrinsics, gyro: Gyroscope) -> Iterator[Finding]:
         )
         return
     missed = f"the turns miss gravity's direction by {math.degrees(gyro.rms_rad):.2g} degrees"
+    if result.sampling.at_limit[result.log.gyro].any() and gyro.rms_rad > _ROUGH_TURNS_RAD:
+        yield Finding(
+            "inconsistent",
+            f"{missed}, as the gyroscope is at the end of its range in some of them",
+            "set the sensor to a wider range, or turn more slowly",
+        )
+        return
     if gyro.rms_rad > _WRONG_TURNS_RAD:
         yield Finding(
             "inconsistent",

@@ -394,6 +394,9 @@ _LEAST_INITIAL_S = 3.0
 _QUIET_QUANTILE = 0.03
 _TIMES_QUIET = 12.0
 _BATCH_S = 0.25
+INSET_S = 1.0
+"""How much of a rest's ends, at most a quarter of it each, may belong to a turn: the accelerometer hardly
+shows how a slow one starts, and up to half a degree of it made the gyroscope's scales 1 % too small."""
 
 
 @dataclass(frozen=True)
@@ -420,8 +423,9 @@ class Rest:
     ----------
     part, start, stop : number of the part, first sample, and the one behind the last.
     from_s, to_s : the same as time stamps.
-    mean : (d,) of the readings.
+    mean : (d,) of the readings of its middle.
     scatter : (d,) long-run variance of a reading: that of a mean of n readings is scatter / n.
+    inset : samples at each end that are no part of its middle.
     """
 
     part: int
@@ -431,11 +435,17 @@ class Rest:
     to_s: float
     mean: FloatArray
     scatter: FloatArray
+    inset: int = 0
 
     @property
     def samples(self) -> int:
         """Number of readings."""
         return self.stop - self.start
+
+    @property
+    def middle(self) -> slice:
+        """Samples of its part without those at its ends, where a slow turn may have begun."""
+        return slice(self.start + self.inset, self.stop - self.inset)
 
     @property
     def duration_s(self) -> float:
@@ -511,10 +521,11 @@ def find_rests(parts: tuple[Part, ...], columns: list[int], s: Spread, threshold
         for start, stop in runs(zeta <= threshold):
             if stop - start < least:
                 continue
-            values = part.values[start:stop][:, columns]
+            inset = min((stop - start) // 4, round(INSET_S / s.period_s))
+            values = part.values[start + inset : stop - inset][:, columns]
             from_s, to_s = float(part.t_s[start]), float(part.t_s[stop - 1]) + s.period_s
             scatter = _scatter(values, s.period_s)
-            rests.append(Rest(number, start, stop, from_s, to_s, values.mean(axis=0), scatter))
+            rests.append(Rest(number, start, stop, from_s, to_s, values.mean(axis=0), scatter, inset))
     return tuple(rests)
 
 
