@@ -127,10 +127,8 @@ def topic_map(bag: Path, topics: Sequence[Topic], given: Path | None = None) -> 
 
 
 def _listed(topics: Sequence[Topic]) -> str:
-    if not topics:
-        return "none"
-    named = [f"{one_line(topic.name)[:80]} ({one_line(topic.kind)[:60]})" for topic in topics[:_SHOWN]]
-    return ", ".join(named) + (f" and {len(topics) - _SHOWN} others" if len(topics) > _SHOWN else "")
+    named = [f"{one_line(topic.name)[:80]} ({one_line(topic.kind)[:60]})" for topic in topics]
+    return several(named, _SHOWN) or "none"
 
 
 def _preset(kind: str, topic: Topic) -> dict[str, str] | None:

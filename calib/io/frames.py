@@ -48,7 +48,7 @@ class Frames:
 
 def is_recording(path: Path) -> bool:
     """Whether a path is a video or a bag."""
-    return not (path.is_dir() and not is_bag(path)) and (path.suffix.lower() in VIDEOS or is_bag(path))
+    return is_bag(path) or (path.suffix.lower() in VIDEOS and not path.is_dir())
 
 
 def read_frames(path: Path, topic: str | None = None) -> Frames:

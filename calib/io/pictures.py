@@ -274,7 +274,7 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     elif is_heic(data):
         decoded = decoded_heic(data, where)
     else:
-        decoded = _decoded(data)
+        decoded = decode(data)
     if decoded is None or decoded.size == 0:
         raise BadInputError(f"{where}: is not a picture that can be decoded")
     height, width = decoded.shape[:2]
@@ -314,10 +314,11 @@ def decoded_heic(data: bytes, where: str) -> AnyArray | None:
     return np.ascontiguousarray(np.rot90(decoded, -(data[at + 4] & 3) if at >= 0 else 0))
 
 
-def _decoded(data: bytes) -> AnyArray | None:
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+def decode(data: bytes, colour: bool = False) -> AnyArray | None:
+    """A picture in the sensor's own rows, in colour or as grey values of any depth; None of a damaged one."""
+    kind = cv2.IMREAD_COLOR if colour else cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE
     try:
-        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), kind | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         return None
 
@@ -328,7 +329,7 @@ def _decoded_with_complaints(data: bytes) -> tuple[AnyArray | None, str]:
         before = os.dup(2)
         try:
             os.dup2(heard.fileno(), 2)
-            decoded = _decoded(data)
+            decoded = decode(data)
         finally:
             os.dup2(before, 2)
             os.close(before)

@@ -535,6 +535,11 @@ def record(
     rows, lines, held = Rows(), "", True
     runs: list[Run] = []
     opening = 0
+
+    def end() -> None:
+        write(len(runs), lines + rows.rest())
+        runs.append(Run(rows.count, rows.lost))
+
     try:
         while more(rows.count):
             for message in decoder.feed(read()):
@@ -542,8 +547,7 @@ def record(
                     if held:
                         opening += rows.count
                     else:
-                        write(len(runs), lines + rows.rest())
-                        runs.append(Run(rows.count, rows.lost))
+                        end()
                     rows, lines, held = Rows(), "", False
                 lines += rows.take(message)
                 held = held and rows.time_s < _OPENING_S
@@ -557,11 +561,10 @@ def record(
     except BadInputError:
         # The board is gone; what it sent is not.
         if rows.count:
-            write(len(runs), lines + rows.rest())
+            end()
         raise
     if rows.count:
-        write(len(runs), lines + rows.rest())
-        runs.append(Run(rows.count, rows.lost))
+        end()
     return Recording(tuple(runs), opening, decoder.skipped, decoder.damaged)
 
 

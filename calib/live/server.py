@@ -38,13 +38,13 @@ from calib.core.errors import BadInputError, CalibError
 from calib.core.files import read_bytes, shown
 from calib.core.rig import Rig
 from calib.core.workers import Failure, Pool, Task, run_tasks
-from calib.io.pictures import declared_pixels, decoded_picture
+from calib.io.pictures import declared_pixels, decode, decoded_picture
 from calib.live.album import MOST_PICTURES, Album, fit_of
 from calib.live.board import Board
 from calib.live.marker import Marker
 from calib.live.plane import Flat
 from calib.live.session import Seen, Session
-from calib.live.sources import MOST_PIXELS, Source, decode
+from calib.live.sources import MOST_PIXELS, Source
 
 PAGE = Path(__file__).with_name("live.html")
 MOST_BYTES = 64_000_000
@@ -496,7 +496,7 @@ class Live:
             tab.shot_until = 0.0
             await self._taken(data, tab.by_hand)
         elif data.startswith(_JPEG) and len(data) <= _MOST_PREVIEW_BYTES:
-            frame = await self._in(self._looking, decode, data)
+            frame = await self._in(self._looking, decode, data, True)
             if frame is None:
                 await tab.tell({"type": "fault", "says": "A frame cannot be decoded."})
                 return
@@ -562,7 +562,7 @@ class Live:
         async def held(request: Request) -> Response:
             del request
             png = self.flat.png
-            frame = None if png is None else await asyncio.to_thread(decode, png)
+            frame = None if png is None else await asyncio.to_thread(decode, png, True)
             if frame is None:
                 return PlainTextResponse("no picture in hand\n", 404)
             return Response(await asyncio.to_thread(_preview, frame), media_type="image/jpeg")
@@ -708,6 +708,6 @@ def _preview(frame: AnyArray) -> bytes:
 
 
 def _thumbnail(path: Path) -> bytes:
-    frame = decode(read_bytes(path))
+    frame = decode(read_bytes(path), colour=True)
     blank = np.zeros((8, 8), dtype=np.uint8)
     return _preview(_smaller(blank if frame is None else frame, 240))

@@ -16,7 +16,7 @@ from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
 from calib.io.frames import opened_video
-from calib.io.pictures import declared_pixels, decoded_heic, holds_pictures, is_heic, list_pictures
+from calib.io.pictures import declared_pixels, decode, decoded_heic, holds_pictures, is_heic, list_pictures
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
 MOST_PIXELS = 30_000_000
@@ -147,7 +147,7 @@ class Watched:
                 if pixels > MOST_PIXELS:
                     raise BadInputError(f"{shown(path)}: has more than {MOST_PIXELS // 10**6} million pixels")
                 if pixels > 0:
-                    frame = decoded_heic(data, shown(path)) if is_heic(data) else decode(data)
+                    frame = decoded_heic(data, shown(path)) if is_heic(data) else decode(data, colour=True)
             except BadInputError as error:
                 self.fault = str(error)
                 return None
@@ -159,18 +159,6 @@ class Watched:
 
     def close(self) -> None:
         """As `Source.close`."""
-
-
-def decode(data: bytes) -> AnyArray | None:
-    """A picture in the sensor's own rows, or None."""
-    import numpy as np
-
-    try:
-        return cv2.imdecode(
-            np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-    except cv2.error:
-        return None
 
 
 def source_of(words: str | None, own: Path) -> Source | None:

@@ -307,14 +307,10 @@ def check_url(url: str, allowed: Allowed) -> None:
 def local_folder(source: str, scratch: Path, allowed: Allowed = Allowed()) -> Path:
     """The rig's folder: the path itself, or `scratch` with what was fetched.
 
-    Raises `BadInputError` for a folder that is not there, cannot be had, or is not to be fetched.
+    Raises `BadInputError` for a URL that cannot be had, or is not to be fetched.
     """
     if not is_url(source):
-        root = Path(source)
-        if not root.is_dir():
-            what = "is a file" if root.exists() else "is not there"
-            raise BadInputError(f"{shown(root)}: {what}, expected the rig's folder")
-        return root
+        return Path(source)
     check_url(source, allowed)
     told = without_secrets(source)
     try:

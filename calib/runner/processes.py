@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.core import __version__
-from calib.core.errors import BadInputError, pip_install
+from calib.core.errors import BadInputError, package, pip_install
 from calib.core.files import one_line
 from calib.core.workers import Failure, Pool, Task, guarded
 from calib.runner.cache import program
@@ -231,10 +231,7 @@ def connected(address: str, tell: Callable[[str], None]) -> Iterator[Cluster]:
 
 def needed(name: str) -> Any:
     """A module by its name. Raises `BadInputError` where it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise BadInputError(f"needs {name} ({error}): {pip_install('fleet')}") from error
+    return package(name, f"needs {name}: {pip_install('fleet')}")
 
 
 def survey() -> tuple[str, str, str]:

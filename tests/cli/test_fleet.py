@@ -104,7 +104,7 @@ def test_killed_worker_killed_client_and_single_runs_end_in_the_same(
     found = json.loads(said)["fleet"]
     assert found["rigs"] == 8 and found["verdicts"]["failed"] == 2 and "lost" not in found["verdicts"]
     looks = {look["name"]: look["why"] for look in found["to_look_at"]}
-    assert "is not there, expected the rig's folder" in looks["gone"] and "a.png" in looks["bad"]
+    assert "is not there, expected a folder with images" in looks["gone"] and "a.png" in looks["bad"]
     whole = _results(out)
     assert set(whole) >= {folder.name for folder in folders}
     assert (out / "fleet.parquet").stat().st_size > 1000
