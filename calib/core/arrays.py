@@ -29,6 +29,11 @@ def blocks(values: FloatArray, size: int) -> FloatArray:
     return values[: len(values) // size * size].reshape(-1, size, *values.shape[1:])
 
 
+def evenly(count: int, most: int) -> IntArray:
+    """At most so many of `count` indices, spread evenly, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, most).astype(np.int64))
+
+
 def points_of(values: npt.ArrayLike, size: int) -> FloatArray:
     """Points (n, size) from those of a caller (..., size), as lists or numbers of any kind.
 

@@ -402,7 +402,7 @@ class Session:
             return
         some = fit.calibration
         if np.all(np.isfinite(some.normal)) and some.observations.views >= _BEFORE:
-            self._plan = self._not_taken(checks.best_next_view(some, checks.evidence(some).S.sum(axis=0)))
+            self._plan = self._not_taken(checks.best_next_view(some))
         worst = projection_sigma_px(some, fit.covariance, checks.image_outline(some.camera))
         sigma = fit.covariance.sigma().get("fx_px", np.inf)
         known = worst[~np.isnan(worst)]

@@ -335,7 +335,6 @@ def test_interlaced_and_sharpened_boards_are_found(shared_data: Path, frame: str
     found = detect(gray, 13, 8)
     assert found is not None
     assert found.refined.all()
-    assert found.misfit_px < 0.2
 
 
 def test_a_board_that_moves_between_two_fields_is_found_at_their_mean_moment(tmp_path: Path) -> None:

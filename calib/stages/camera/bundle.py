@@ -147,7 +147,7 @@ def linearise(
     for first in range(0, views, chunk):
         part = slice(first, first + chunk)
         some = basis[part] if basis is not None and basis.ndim == 4 else basis
-        J = jacobian(block.part(part), observations.part(part), free, some)
+        J = jacobian(block.part(part), observations.select(part), free, some)
         if J is None:
             return None
         residuals[part] = J[:, -1].reshape(-1, 2, points)

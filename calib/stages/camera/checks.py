@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, evenly
 from calib.core.geometry import box_grid, rotation_exp
 from calib.solve.information import scaled_inverse
 from calib.stages.camera import bundle, model
@@ -139,10 +140,9 @@ def image_outline(camera: model.Camera) -> FloatArray:
     The corners of a fisheye lens's picture often show nothing.
     """
     width, height = camera.image_size_px
-    u, v = np.linspace(0, width - 1, _PER_SIDE), np.linspace(0, height - 1, _PER_SIDE)
-    top = np.stack([u[:-1], np.zeros(_PER_SIDE - 1)], axis=1)
-    right = np.stack([np.full(_PER_SIDE - 1, width - 1.0), v[:-1]], axis=1)
-    border = np.concatenate([top, right, [width - 1, height - 1] - top, [width - 1, height - 1] - right])
+    outside = np.ones((_PER_SIDE, _PER_SIDE), dtype=np.bool_)
+    outside[1:-1, 1:-1] = False
+    border = box_grid((0.0, 0.0, width - 1.0, height - 1.0), _PER_SIDE, _PER_SIDE)[outside]
     if not camera.fisheye:
         return border
     centre = camera.centre_px
@@ -313,6 +313,22 @@ def view_faults(observations: model.Observations) -> list[str]:
 # Deformations of the target enter as further shared parameters that rest at zero.
 
 
+class Solution(NamedTuple):
+    """Where the cost of all views together is least.
+
+    Attributes
+    ----------
+    step, inverse : (G,) of the shared parameters, and (G, G) their covariance over a coordinate's variance.
+    fall : of the cost.
+    variance : of a coordinate, once the cost has fallen.
+    """
+
+    step: FloatArray
+    inverse: FloatArray
+    fall: float
+    variance: float
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Quadratic cost of every view about a calibration.
@@ -335,6 +351,19 @@ class Evidence:
     cost: FloatArray
     measured: IntArray
     sigma_px: float
+
+    def of(self, views: IntArray | BoolArray) -> Evidence:
+        """The same of some views."""
+        rows = ("S", "b", "cost", "measured")
+        return replace(self, **{name: getattr(self, name)[views] for name in rows})
+
+    def solved(self, floor: float = 1e-13) -> Solution:
+        """One camera for all views, one step away; `floor` as of `scaled_inverse`."""
+        S, b = self.S.sum(axis=0), self.b.sum(axis=0)
+        inverse, fall = scaled_inverse(S, floor), float(gain(S, b))
+        freedom = int((self.measured - 6).sum()) - len(b)
+        left = max(float(self.cost.sum()) - fall, 0.0) / max(freedom, 1)
+        return Solution(-inverse @ b, inverse, fall, left)
 
     def cost_at(self, d: FloatArray) -> FloatArray:
         """c_i(d), (N,)."""
@@ -396,76 +425,40 @@ def evidence(
     )
 
 
-@dataclass(frozen=True)
-class Skew:
-    """What the views say of a skew that a calibration leaves out.
+class LeftOut(NamedTuple):
+    """What the views say of intrinsics that a calibration leaves out, everything else following.
 
     Attributes
     ----------
-    skew_px, sigma_px : one step to it, everything else following, and its standard deviation, the views'
-        overdispersion included.
+    chi2 : of one step to them, with a degree of freedom for each, the views' overdispersion included.
     moved_px : root mean square change of the directions seen, in the picture.
-    shear_chi2 : by how much a sheared board lowers the cost more than the skew does, over the variance.
+    shear_chi2 : by how much a sheared board lowers the cost more than they do, over the variance.
     """
 
-    skew_px: float
-    sigma_px: float
+    chi2: float
     moved_px: float
     shear_chi2: float
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """What the views say of intrinsics that a calibration leaves out.
-
-    Attributes
-    ----------
-    step, cov : (k,), (k, k) one step to them, everything else following, and its covariance, the views'
-        overdispersion included.
-    moved_px : root mean square change of the directions seen, in the picture.
-    fall, variance : of the cost, and of a coordinate once it has fallen, the overdispersion included.
-    """
-
-    step: FloatArray
-    cov: FloatArray
-    moved_px: float
-    fall: float
-    variance: float
-
-    @property
-    def chi2(self) -> float:
-        """Of the step, with k degrees of freedom."""
-        return float(self.step @ scaled_inverse(self.cov) @ self.step)
-
-
-def left_out(calibration: bundle.Calibration, names: Sequence[str]) -> LeftOut:
+def left_out(calibration: bundle.Calibration, *names: str) -> LeftOut:
     """What a calibration without these intrinsics leaves out."""
-    freed = replace(
-        calibration, free=np.union1d(calibration.free, [model.INTRINSICS.index(n) for n in names])
-    )
+    freed = _freed(calibration, *names)
     found = evidence(freed)
-    S, b = found.S.sum(axis=0), found.b.sum(axis=0)
-    inverse, fall = scaled_inverse(S), float(gain(S, b))
-    step = -inverse @ b
-    left = max(calibration.squared_sum - fall, 0.0) / max(calibration.degrees_of_freedom - len(names), 1)
+    one = found.solved()
     # Scatter of the views about the step, where the intrinsics are taken out.
-    about = replace(found, b=found.b + found.S @ step, sigma_px=math.sqrt(left))
-    variance = left * overdispersion(about) ** 2
+    about = replace(found, b=found.b + found.S @ one.step, sigma_px=math.sqrt(one.variance))
+    variance = one.variance * overdispersion(about) ** 2
     at = [found.names.index(name) for name in names]
-    return LeftOut(step[at], variance * inverse[np.ix_(at, at)], apart_px(freed, step), fall, variance)
+    chi2 = one.step[at] @ scaled_inverse(variance * one.inverse[np.ix_(at, at)]) @ one.step[at]
+    sheared = evidence(calibration, _basis(calibration)[0][..., 1:2, :, :], ("shear",)).solved()
+    shear_chi2 = (sheared.fall - one.fall) / max(variance, 1e-300)
+    return LeftOut(float(chi2), apart_px(freed, one.step), shear_chi2)
 
 
-def skew_left_out(calibration: bundle.Calibration) -> Skew:
-    """The skew that a calibration without one would have."""
-    found = left_out(calibration, ["skew_px"])
-    sheared = evidence(calibration, _basis(calibration)[0][..., 1:2, :, :], ("shear",))
-    other = float(gain(sheared.S.sum(axis=0), sheared.b.sum(axis=0)))
-    return Skew(
-        float(found.step[0]),
-        math.sqrt(max(found.cov[0, 0], 0.0)),
-        found.moved_px,
-        (other - found.fall) / max(found.variance, 1e-300),
-    )
+def _freed(calibration: bundle.Calibration, *names: str) -> bundle.Calibration:
+    """The calibration as if these intrinsics had been estimated."""
+    more = [model.INTRINSICS.index(name) for name in names]
+    return replace(calibration, free=np.union1d(calibration.free, more))
 
 
 def gain(S: FloatArray, b: FloatArray) -> FloatArray:
@@ -503,8 +496,7 @@ def alone_px(calibration: bundle.Calibration) -> tuple[float, float]:
     Of all views but the one that would gain most, as one bad view is no change in the others. One step of
     each view's parameters, in the directions of which it tells anything.
     """
-    free = np.union1d(calibration.free, [model.INTRINSICS.index("skew_px")])
-    found = evidence(replace(calibration, free=free))
+    found = evidence(_freed(calibration, "skew_px"))
     root = _root(found)
     told, Q = np.linalg.eigh(root.T @ found.S @ root)
     y2 = np.einsum("ngk,ng->nk", root @ Q, found.b) ** 2
@@ -605,15 +597,10 @@ def target_shape(calibration: bundle.Calibration) -> TargetShape | None:
         return None
     basis, half = _basis(calibration)
     found = evidence(calibration, basis, DEFORMATIONS)
-    P = found.intrinsics
-    S, b = found.S.sum(axis=0), found.b.sum(axis=0)
-    inverse = scaled_inverse(S, 1e-12)
-    step = -inverse @ b
-    left = max(calibration.squared_sum - float(gain(S, b)), 0.0)
-    freedom = max(calibration.degrees_of_freedom - len(DEFORMATIONS), 1)
-    inflation = overdispersion(found)
+    P, S = found.intrinsics, found.S.sum(axis=0)
+    step, inverse, _, variance = found.solved(1e-12)
     # Noise after the deformations are taken out, lest they hide in their own residuals.
-    cov = inverse * (left / freedom) * inflation**2
+    cov = inverse * variance * overdispersion(found) ** 2
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     bows = step[P + 2 :]
     wald = float(bows @ np.linalg.pinv(cov[P + 2 :, P + 2 :], hermitian=True) @ bows)
@@ -659,17 +646,14 @@ def drift(calibration: bundle.Calibration) -> FloatArray | None:
     found = evidence(calibration, _basis(calibration)[0], DEFORMATIONS)
     t = np.linspace(-1.0, 1.0, views)
     step, certain = _step(found, t)
-    if not certain or not all(_step(found, t, np.arange(views) != i)[1] for i in range(views)):
+    others = (np.arange(views) != i for i in range(views))
+    if not certain or not all(_step(found.of(kept), t[kept])[1] for kept in others):
         return None
     return step / math.sqrt(3.0)
 
 
-def _step(found: Evidence, t: FloatArray, kept: BoolArray | None = None) -> tuple[FloatArray, bool]:
+def _step(found: Evidence, t: FloatArray) -> tuple[FloatArray, bool]:
     """Change (P,) of the intrinsics for one unit of t (N,), and whether some of it is certain."""
-    if kept is not None:
-        S, b = found.S[kept], found.b[kept]
-        found = replace(found, S=S, b=b, cost=found.cost[kept], measured=found.measured[kept])
-        t = t[kept]
     P = found.intrinsics
     late, later = np.einsum("n,ngh->gh", t, found.S)[:, :P], np.einsum("n,ngh->gh", t**2, found.S)[:P, :P]
     S = np.block([[found.S.sum(axis=0), late], [late.T, later]])
@@ -862,10 +846,9 @@ def best_of_starts(calibration: bundle.Calibration) -> bundle.Calibration:
     """
     if calibration.basis is not None or calibration.loss != "none":
         return calibration
-    some, views = calibration, calibration.observations.views
-    chance = CHI2_95 * calibration.sigma_px**2
-    if views > _MAX_VIEWS:
-        index = np.unique(np.linspace(0, views - 1, _MAX_VIEWS).astype(np.int64))
+    some, chance = calibration, CHI2_95 * calibration.sigma_px**2
+    if calibration.observations.views > _MAX_VIEWS:
+        index = evenly(calibration.observations.views, _MAX_VIEWS)
         some = replace(
             calibration,
             observations=calibration.observations.select(index),
@@ -1078,17 +1061,14 @@ def _replicates(problem: _Problem, rng: np.random.Generator) -> list[_Problem]:
     """Scores as one camera would give them, centred on its solution."""
     values, vectors = np.linalg.eigh(problem.S)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    inverse = scaled_inverse(problem.S.sum(axis=0))
-    made = []
-    for _ in range(_REPLICATES):
-        b = np.einsum("ngh,nh->ng", root, rng.standard_normal(problem.b.shape))
-        b = b - problem.S @ (inverse @ b.sum(axis=0))
-        made.append(_Problem(problem.S, b, float(problem.freedom), problem.freedom))
-    return made
+    scores = [np.einsum("ngh,nh->ng", root, rng.standard_normal(problem.b.shape)) for _ in range(_REPLICATES)]
+    return [_centred(replace(problem, b=b, cost=float(problem.freedom))) for b in scores]
 
 
-def _reach(statistics: list[FloatArray]) -> FloatArray:
-    return np.asarray(np.mean(statistics, axis=0) + _QUANTILE * np.std(statistics, axis=0, ddof=1))
+def _centred(problem: _Problem) -> _Problem:
+    """The same about the solution of all views."""
+    d = scaled_inverse(problem.S.sum(axis=0)) @ problem.b.sum(axis=0)
+    return replace(problem, b=problem.b - problem.S @ d)
 
 
 def _sturdy(problem: _Problem, search: Callable[[_Problem], FloatArray]) -> FloatArray:
@@ -1141,13 +1121,9 @@ def apart_px(calibration: bundle.Calibration, difference: FloatArray) -> float:
 
 def _without(problem: _Problem, odd: IntArray) -> _Problem:
     """The same without some views, centred on the others' solution."""
-    N = len(problem.b)
-    kept = ~np.isin(np.arange(N), odd)
-    S, b = problem.S[kept], problem.b[kept]
-    whole = b.sum(axis=0)
-    inverse = scaled_inverse(S.sum(axis=0))
-    cost = problem.cost * kept.sum() / N
-    return _Problem(S, b - S @ (inverse @ whole), cost, problem.freedom)
+    kept = ~np.isin(np.arange(len(problem.b)), odd)
+    part = replace(problem, S=problem.S[kept], b=problem.b[kept], cost=problem.cost * kept.mean())
+    return _centred(part)
 
 
 def best_split(calibration: bundle.Calibration) -> Split | None:
@@ -1172,7 +1148,8 @@ def best_split(calibration: bundle.Calibration) -> Split | None:
         return best, np.array([one.max() for one in found])
 
     divisions, statistics = search(problem, _STARTS, _LEAST)
-    chances = _reach([search(made, 6, _LEAST)[1] for made in _replicates(problem, rng)])
+    replicates = [search(made, 6, _LEAST)[1] for made in _replicates(problem, rng)]
+    chances = np.mean(replicates, axis=0) + _QUANTILE * np.std(replicates, axis=0, ddof=1)
     statistics = np.minimum(statistics, _sturdy(problem, lambda one: search(one, 6, 2)[1]))
     # Of few divisions less is reached by chance.
     ordered = bool(statistics[1] / chances[1] > _IN_ORDER * statistics[0] / chances[0])
@@ -1271,16 +1248,13 @@ def tilted(tilt_deg: float, away: str) -> FloatArray:
     return np.asarray(rotation_exp(np.radians(tilt_deg) * axis)[0])
 
 
-def best_next_view(calibration: bundle.Calibration, information: FloatArray) -> Plan | None:
+def best_next_view(calibration: bundle.Calibration) -> Plan | None:
     """Of about a hundred poses of the board those that fit into the picture, the most useful first.
 
     A pose that a view has is left out unless there is no other: the same picture once more lowers sigma on
     paper only.
-
-    Parameters
-    ----------
-    information : (G, G) sum of the views' information about the free intrinsics, pixels squared.
     """
+    information = evidence(calibration).S.sum(axis=0)
     camera = calibration.camera
     width, height = camera.image_size_px
     box = target_box(calibration)

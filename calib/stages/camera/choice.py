@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.core.errors import BadInputError
-from calib.stages.camera.bundle import calibrate, linearise
-from calib.stages.camera.checks import eliminated, repeated_views
+from calib.stages.camera.bundle import calibrate
+from calib.stages.camera.checks import evidence, repeated_views
 from calib.stages.camera.model import View, pack
 
 # A view's information about the intrinsics, with its own pose eliminated, is S_i (see `checks`), over the
@@ -32,13 +31,11 @@ def most_informative(views: Sequence[View], image_size_px: tuple[int, int]) -> l
     packed = pack(views)
     try:
         fit = calibrate(packed, image_size_px, _MODEL, tolerance=1e-2, max_iterations=40)
-    except (BadInputError, np.linalg.LinAlgError):
-        return every
-    at = linearise(fit.block, fit.observations, fit.free, None)
-    if at is None or not np.all(np.isfinite(at.normal)):
+        S = evidence(fit).S
+    except (np.linalg.LinAlgError, ValueError):
         return every
     G, rms = len(fit.free), fit.view_rms_px
-    S = eliminated(at.normal, at.gradient)[0] / np.maximum(rms, np.median(rms))[:, None, None] ** 2
+    S = S / np.maximum(rms, np.median(rms))[:, None, None] ** 2
     scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->i", S), 1e-300))
     S = S * scale * scale[:, None]
     total = _LITTLE * np.eye(G)

@@ -129,13 +129,10 @@ _FINE = 1 / 14
 
 def _turns_alike(points: FloatArray) -> bool:
     """Whether every square is convex and turns the same way."""
-    a, b = points[:-1, :-1], points[:-1, 1:]
-    c, d = points[1:, 1:], points[1:, :-1]
-    sides = [b - a, c - b, d - c, a - d]
-    for one, two in zip(sides, sides[1:] + sides[:1], strict=True):
-        if np.any(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0] <= 0):
-            return False
-    return True
+    corners = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]])
+    one = np.roll(corners, -1, axis=0) - corners
+    two = np.roll(one, -1, axis=0)
+    return bool(np.all(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0] > 0))
 
 
 def _squares_are_plain(grid: Refined, close: bool) -> bool:
@@ -257,20 +254,6 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What is beyond the four sides of a grid's arrays: top, bottom, left, right.
-
-    Attributes
-    ----------
-    continues : whether another row of corners follows.
-    seen : whether the picture shows where that row would be.
-    """
-
-    continues: tuple[bool, ...]
-    seen: tuple[bool, ...]
-
-
 def _ringed(points: FloatArray) -> FloatArray:
     """A grid (rows, columns, 2) and the places of one more corner on each side."""
     wide = extrapolated(points)
@@ -281,10 +264,11 @@ def _ringed(points: FloatArray) -> FloatArray:
     return wide
 
 
-def surroundings(grid: Refined) -> Surroundings:
-    """Look for another row of corners on each side.
+def surroundings(grid: Refined) -> tuple[list[bool], list[bool]]:
+    """Whether another row of corners follows on each side, and whether the picture shows where it would be.
 
-    A part of a larger board is not the board: which part it is cannot be told.
+    Sides of the grid's arrays: top, bottom, left, right. A part of a larger board is not the board: which
+    part it is cannot be told.
     """
     part = grid.part
     local = _ringed(part.from_picture(grid.points))
@@ -319,8 +303,7 @@ def surroundings(grid: Refined) -> Surroundings:
         found[chosen] = fit.converged & near & strong & alike
     hit = found.reshape(rows, columns)
     hits = [int(hit[line].sum()) for line in lines]
-    continues = tuple(h >= n for h, n in zip(hits, needed, strict=True))
-    return Surroundings(continues, tuple(n >= 2 for n in count))
+    return [h >= n for h, n in zip(hits, needed, strict=True)], [n >= 2 for n in count]
 
 
 # ----------------------------------------------------------------------
@@ -484,12 +467,12 @@ def _whole(gray: GrayImage, points: FloatArray, within: bool, covered: bool = Fa
         grid = refine(gray, points)
         if grid is None or fault_of(gray, grid) is not None:
             return None
-        around = surroundings(grid)
-        top, bottom, left, right = around.continues
-        if not any(around.continues):
+        continues, seen = surroundings(grid)
+        top, bottom, left, right = continues
+        if not any(continues):
             sure = covered or bool(grid.refined.all() and grid.narrow.mean() < _NARROW)
             sure &= grid.misfit_px < _SIZE_MISFIT * square_px(grid.points)
-            return grid if sure and (all if within else any)(around.seen) else None
+            return grid if sure and (all if within else any)(seen) else None
         wide = _ringed(grid.points)
         rows, columns = wide.shape[:2]
         points = wide[
@@ -566,7 +549,6 @@ class Detection:
     refined : (rows * columns,) False where the corner itself could not be measured: `pixels` then has
         its place between the others and must not be taken for a measurement.
     contrast : median half step from dark to bright, grey levels.
-    misfit_px : typical distance of a corner from where the others, by a smooth fit, place it.
     alone : whether no other board of this size was seen beside it, with smaller squares.
     """
 
@@ -576,7 +558,6 @@ class Detection:
     sigma_px: FloatArray
     refined: BoolArray
     contrast: float
-    misfit_px: float
     alone: bool = True
 
 
@@ -596,7 +577,6 @@ def _ordered(grid: Refined, columns: int, rows: int, alone: bool) -> Detection |
         sigma_px=np.rot90(grid.sigma_px, turn).ravel(),
         refined=np.rot90(grid.refined, turn).ravel(),
         contrast=float(np.median(np.abs(grid.amplitude))),
-        misfit_px=grid.misfit_px,
         alone=alone,
     )
 
@@ -604,7 +584,7 @@ def _ordered(grid: Refined, columns: int, rows: int, alone: bool) -> Detection |
 def _boards(gray: GrayImage, grids: Sequence[FloatArray]) -> list[Refined]:
     """The grids that pass every test, the one with the largest squares first."""
     refined = [grid for points in grids if (grid := refine(gray, points)) is not None]
-    sound = [g for g in refined if fault_of(gray, g) is None and not any(surroundings(g).continues)]
+    sound = [g for g in refined if fault_of(gray, g) is None and not any(surroundings(g)[0])]
     return sorted(sound, key=lambda grid: -square_px(grid.points))
 
 

@@ -15,7 +15,6 @@ from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
 from calib.core.workers import Workers
 from calib.solve.chance import tail_of_t
-from calib.solve.information import scaled_inverse
 from calib.stages.camera import checks
 from calib.stages.camera.bundle import (
     Calibration,
@@ -176,12 +175,6 @@ def board_basis(target_m: FloatArray, kind: str) -> FloatArray | None:
     return kept.reshape(-1, M, 3).transpose(0, 2, 1)
 
 
-def _folds(views: int) -> list[IntArray]:
-    """Indices of the views held back in each fold, interleaved so that a sequence is spread over folds."""
-    count = min(_FOLDS, views)
-    return [np.arange(first, views, count, dtype=np.int64) for first in range(count)]
-
-
 def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
     """Mean squared residual vector (len(fits), N) of each view by a camera that has not seen it.
 
@@ -193,7 +186,8 @@ def _on_held_back(fits: Sequence[Calibration]) -> FloatArray:
     if not fits:
         return np.zeros((0, 0))
     views = fits[0].observations.views
-    folds = _folds(views)
+    # Interleaved, so that a sequence is spread over the folds.
+    folds = [np.arange(views)[first::_FOLDS] for first in range(min(_FOLDS, views))]
     squared = np.array([_by_evidence(fit, folds) for fit in fits])
     gain_px2 = (_GAIN_PX * scale_of(fits[0].camera.image_size_px)) ** 2
     rational = np.array([fit.camera.model == "rational8" for fit in fits])
@@ -216,9 +210,8 @@ def _by_evidence(fit: Calibration, folds: Sequence[IntArray]) -> FloatArray:
     found = checks.evidence(fit, fit.basis)
     squared = np.empty(len(found.cost))
     for fold in folds:
-        kept = np.setdiff1d(np.arange(len(squared)), fold)
-        d = -scaled_inverse(found.S[kept].sum(axis=0)) @ found.b[kept].sum(axis=0)
-        squared[fold] = found.cost_at(d)[fold]
+        others = found.of(np.setdiff1d(np.arange(len(squared)), fold))
+        squared[fold] = found.cost_at(others.solved().step)[fold]
     return squared / np.maximum(found.measured / 2, 1)
 
 
@@ -517,15 +510,15 @@ def _decentred(fit: Calibration) -> bool:
     """
     if fit.camera.fisheye or "p1" in fit.free_names:
         return False
-    found = checks.left_out(fit, ("p1", "p2"))
+    found = checks.left_out(fit, "p1", "p2")
     return found.chi2 > _DECENTRED_CHI2 and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px)
 
 
 def _skewed(fit: Calibration) -> bool:
     """Whether the views show a skew that a fit without one leaves out, and that matters."""
-    found = checks.skew_left_out(fit)
+    found = checks.left_out(fit, "skew_px")
     return (
-        abs(found.skew_px) > _SKEW_SIGMAS * found.sigma_px
+        found.chi2 > _SKEW_SIGMAS**2
         and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px)
         and found.shear_chi2 < _SKEW_SIGMAS**2
     )

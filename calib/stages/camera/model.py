@@ -141,20 +141,11 @@ class Observations:
         """Whether the target's points are the same in every view."""
         return bool(self.target_m.shape[0] == 1)
 
-    def select(self, index: IntArray | Sequence[int]) -> Observations:
-        """The views at these indices, in this order."""
-        chosen = np.asarray(index, dtype=np.int64)
-        return Observations(
-            names=tuple(self.names[i] for i in chosen),
-            target_m=self.target_m if self.same_target else self.target_m[chosen],
-            pixels=self.pixels[chosen],
-            present=self.present[chosen],
-        )
-
-    def part(self, views: slice) -> Observations:
-        """A run of views, without copying."""
+    def select(self, views: slice | IntArray | Sequence[int]) -> Observations:
+        """The views at these indices, in this order, or a run of views, which is not copied."""
+        names = self.names[views] if isinstance(views, slice) else tuple(self.names[i] for i in views)
         target = self.target_m if self.same_target else self.target_m[views]
-        return Observations(self.names[views], target, self.pixels[views], self.present[views])
+        return Observations(names, target, self.pixels[views], self.present[views])
 
     def displaced(self, displacement_m: FloatArray) -> Observations:
         """The same pixels of a target whose points are moved by `displacement_m` (M, 3)."""

@@ -198,8 +198,8 @@ def compare_pictures(
     ends = np.cumsum([len(view.pixels) for view in views])[:-1]
     for view, residuals in zip(views, np.split(pose.residuals_px, ends), strict=True):
         moved, squared = np.nan, np.sum(residuals**2, axis=1)
-        own = _own_pose(camera, view) if len(views) > 1 else None
-        if own is not None:
+        with suppress(BadInputError):
+            own = fit_pose(camera, view.target_m, view.pixels)
             tested.append((float(squared.sum()), own.cost_px2, 2 * len(squared) - 6))
             moved = float(np.sqrt(np.mean(np.sum((own.residuals_px - residuals) ** 2, axis=1))))
         fits.append(PictureFit(view.name, len(squared), float(np.sqrt(np.mean(squared))), moved))
@@ -232,13 +232,6 @@ def _alike(views: Sequence[View], residuals_px: FloatArray) -> float:
     r = products / max(squares, 1e-300)
     most = max(len(view.pixels) for view in views) / 6.0
     return 1.0 if r < _ALIKE else max(1.0, min(((1.0 + r) / (1.0 - r)) ** 2, most))
-
-
-def _own_pose(camera: Camera, view: View) -> Pose | None:
-    try:
-        return fit_pose(camera, view.target_m, view.pixels)
-    except BadInputError:
-        return None
 
 
 def _findings(
@@ -660,15 +653,12 @@ class Placement:
     ----------
     pixels : (columns * rows, 2), row by row from the corner (0, 0).
     quarter_turns : by how many quarter turns, clockwise as seen, the detected order was turned.
-    x_axis_deg : direction of the world's x axis in the picture at the board's centre; 0 is right,
-        90 is down.
     how : one sentence that says how the orientation was settled.
     doubt : a sentence where the board's colours say otherwise, else empty.
     """
 
     pixels: FloatArray
     quarter_turns: int
-    x_axis_deg: float
     how: str
     doubt: str = ""
 
@@ -753,7 +743,7 @@ def settle_orientation(
             "corner cannot be told; give first_corner_px: [u, v] in board.yaml"
         )
     limit = 90 if len(candidates) == 2 else 45
-    tells = (board.columns + board.rows) % 2 == 1
+    tells = not board.half_turn_looks_the_same
     looks = "looks the same after a quarter turn" if limit == 45 else "can be read from either end"
     looks = "has ends of different colours" if tells else looks
     how = (
@@ -774,7 +764,7 @@ def settle_orientation(
             f"{name}: the world's x axis points {_words(degrees)} in the picture: {board.columns}x"
             f"{board.rows} may be the wrong order of corners, or angle_rad that of the other axis"
         )
-    return Placement(chosen, turn, degrees, how, doubt)
+    return Placement(chosen, turn, how, doubt)
 
 
 def _words(degrees: float) -> str:
@@ -808,4 +798,4 @@ def _settle_by_pixel(
         f"px from first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right "
         "(positive is down)."
     )
-    return Placement(chosen, turn, degrees, how)
+    return Placement(chosen, turn, how)

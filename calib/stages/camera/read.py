@@ -221,9 +221,9 @@ def find_boards(
     usable = {path: one for path, one in pictures.items() if one.size_px == size_px}
     if not usable:
         which = list(pictures.values())
-        width, height = which[0].size_px
+        (width, height), are = which[0].size_px, "is" if len(which) == 1 else "are"
         raise BadInputError(
-            f"{_names(which)}: {_is_or_are(which)} {width}x{height} px, expected {size_px[0]}x{size_px[1]} px"
+            f"{_names(which)}: {are} {width}x{height} px, expected {size_px[0]}x{size_px[1]} px"
         )
     with Workers(_Album(list(usable), list(usable.values())), len(usable)) as workers:
         looking = _Search(workers, list(usable.values()), size_px, square_m, progress)
@@ -348,7 +348,8 @@ class _Search:
         if len(plain) < len(others):
             # Tiles of a floor pass for a plain board in some pictures of a board of markers.
             layout = self._layout(others, None)
-            if layout is not None and (not plain or self._showing(others, layout) > len(plain)):
+            jobs = [(targets.shows, i, (layout,)) for i in others]
+            if layout is not None and (not plain or sum(map(bool, self._each(jobs, others))) > len(plain)):
                 return self._with_markers(corners, layout, layout.dictionary)
         if not plain:
             other_target = self._asked(targets.name_of, sample)
@@ -416,10 +417,6 @@ class _Search:
             if layout is not None:
                 return layout
         return None
-
-    def _showing(self, which: Sequence[int], layout: targets.Layout) -> int:
-        """How many of these pictures show a board of markers."""
-        return sum(map(bool, self._each([(targets.shows, i, (layout,)) for i in which], which)))
 
     def _with_markers(
         self, corners: tuple[int, int] | None, layout: targets.Layout | None, dictionary: str
@@ -522,10 +519,6 @@ _READS = (
 
 def _shows(pictures: Sequence[Picture]) -> str:
     return "the picture shows" if len(pictures) == 1 else "the pictures show"
-
-
-def _is_or_are(pictures: Sequence[Picture]) -> str:
-    return "is" if len(pictures) == 1 else "are"
 
 
 def _count(pictures: int) -> str:

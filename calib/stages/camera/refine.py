@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from calib.core.arrays import BoolArray, FloatArray, GrayImage, IntArray
+from calib.core.arrays import BoolArray, FloatArray, GrayImage, IntArray, evenly
 from calib.core.geometry import linear_homographies
 from calib.stages.camera.lattice import checkered, extrapolated
 
@@ -1061,7 +1061,7 @@ def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
     while part is not None:
         every = np.arange(points[..., 0].size)
         # Of blocks that may be too large a few corners tell.
-        some = every if part.k == 1 else _spread(len(every))
+        some = every if part.k == 1 else evenly(len(every), _FEW_CORNERS)
         first = _first_fit(part, some)
         k = min(largest, max(1, int(part.k * _blocks(float(np.median(first.width_px))))))
         if k == part.k:
@@ -1071,11 +1071,6 @@ def _begun(gray: GrayImage, points: FloatArray) -> tuple[Part, LocalFit] | None:
         # The next time blocks can only become smaller.
         largest, part = k, part_around(gray, points, k)
     return None
-
-
-def _spread(count: int) -> IntArray:
-    """A few of so many corners."""
-    return np.linspace(0, count - 1, min(_FEW_CORNERS, count)).astype(np.int64)
 
 
 def _first_fit(part: Part, some: IntArray, warm: LocalFit | None = None) -> LocalFit:
@@ -1100,7 +1095,7 @@ def _moved(part: Part) -> tuple[Part, LocalFit] | None:
         return fit_corners(other, part.points.reshape(-1, 2)[some], frames_of(part.points).take(some))
 
     every = np.arange(part.points[..., 0].size)
-    rho = correlated(_spread(len(every))).parameters[:, _PARAMETERS]
+    rho = correlated(evenly(len(every), _FEW_CORNERS)).parameters[:, _PARAMETERS]
     alike = max(np.mean(rho > _CORRELATED), np.mean(rho < -_CORRELATED))
     return (other, correlated(every)) if alike > _ALIKE else None
 
@@ -1109,13 +1104,12 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
     """The same with the halo that fits best, where the corners are not those of a picture as taken."""
     if float(np.median(misshape(first, part.noise))) < _HALO_MISSHAPE:
         return part, first
-    count = len(first.points)
+    some, every = evenly(len(first.points), _FEW_CORNERS), np.arange(len(first.points))
 
     def with_halo(halo_px: float, chosen: IntArray) -> tuple[Part, LocalFit]:
         other = replace(part, halo_px=halo_px)
         return other, _first_fit(other, chosen, first.take(chosen))
 
-    some = _spread(count)
     plain = float(np.median(misshape(first.take(some), part.noise)))
     left: dict[float, float] = {}
     for halo_px in _HALOS_PX:
@@ -1123,7 +1117,7 @@ def _sharpened(part: Part, first: LocalFit) -> tuple[Part, LocalFit]:
         if min(left.values()) > _HALO_SIGN * plain:
             return part, first
     best = min(sorted(left), key=lambda halo_px: left[halo_px])
-    return with_halo(best, np.arange(count)) if left[best] < _HALO_GAIN * plain else (part, first)
+    return with_halo(best, every) if left[best] < _HALO_GAIN * plain else (part, first)
 
 
 def refine(gray: GrayImage, points: FloatArray) -> Refined | None:

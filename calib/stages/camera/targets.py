@@ -180,17 +180,13 @@ def in_place(markers: Markers, layout: Layout) -> tuple[Markers, float]:
 
 
 def _layouts() -> list[Layout]:
-    boards = [
-        Layout("charuco", "", columns, 0, first_white)
-        for columns in range(3, _MOST_COLUMNS)
-        for first_white in (False, True)
+    kinds = (("charuco", 3, "first_white"), ("grid", 2, "upward"))
+    return [
+        Layout(kind, "", columns, 0, **{either: way})
+        for kind, fewest, either in kinds
+        for columns in range(fewest, _MOST_COLUMNS)
+        for way in (False, True)
     ]
-    grids = [
-        Layout("grid", "", columns, 0, False, upward)
-        for columns in range(2, _MOST_COLUMNS)
-        for upward in (False, True)
-    ]
-    return boards + grids
 
 
 def _layout_of(pictures: Sequence[Markers], dictionary: str) -> Layout | None:
@@ -379,7 +375,6 @@ def _ordered(
         sigma_px=sigma.ravel(),
         refined=measured.ravel(),
         contrast=float(np.median(np.abs(grid.amplitude))),
-        misfit_px=grid.misfit_px,
     )
 
 

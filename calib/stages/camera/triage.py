@@ -33,7 +33,7 @@ from itertools import combinations
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, evenly
 from calib.core.words import several
 from calib.solve.chance import tail_of_f
 from calib.solve.information import scaled_inverse
@@ -189,8 +189,8 @@ def _first_core(found: checks.Evidence) -> BoolArray:
             if np.array_equal(new, core):
                 break
             core = new
-        d = -scaled_inverse(S[core].sum(axis=0)) @ b[core].sum(axis=0)
-        there = found.cost_at(d)[core].sum() / found.measured[core].sum()
+        some = found.of(core)
+        there = some.cost_at(some.solved().step).sum() / some.measured.sum()
         if there < least:
             best, least = core, there
     return best
@@ -211,7 +211,7 @@ def agreement(calibration: Calibration, core: BoolArray | None = None) -> Agreem
     cov = scaled_inverse(one.S_core) * one.typical * one.phi2
     sigma = np.sqrt(np.maximum(np.diag(cov), 0.0))
     # Leaving the core moves the camera from the core's solution to d; joining it, by one step to the view.
-    centre = -scaled_inverse(one.S_core) @ found.b[core].sum(axis=0)
+    centre = found.of(core).solved().step
     joined = np.linalg.solve(one.S_core + found.S + 1e-12 * np.eye(len(sigma)), one.score[..., None])[..., 0]
     shift = np.where(core[:, None], one.d - centre, joined)
     rms = np.sqrt(found.cost / np.maximum(found.measured / 2, 1))
@@ -380,9 +380,8 @@ def _parted(found: checks.Evidence, other: checks.Evidence) -> tuple[BoolArray, 
     (found, unit), (other, _) = _scaled(found, whole), _scaled(other, whole)
     N, G = found.b.shape
     weak = 1e-3 * found.S.sum(axis=0) / N + 1e-9 * np.eye(G)
-    seeds = np.unique(np.linspace(0, N - 1, _TURN_STARTS).astype(np.int64))
     best, least = (np.zeros(N, dtype=np.bool_), np.zeros(G)), np.inf
-    for start in (None, *seeds):
+    for start in (None, *evenly(N, _TURN_STARTS)):
         d = np.zeros(G) if start is None else -np.linalg.solve(found.S[start] + weak, found.b[start])
         turned = np.zeros(N, dtype=np.bool_)
         for step in range(_TURN_STEPS):
@@ -390,7 +389,7 @@ def _parted(found: checks.Evidence, other: checks.Evidence) -> tuple[BoolArray, 
             if step and np.array_equal(turned, before):
                 break
             read = _read(found, other, turned)
-            d = -scaled_inverse(read.S.sum(axis=0)) @ read.b.sum(axis=0)
+            d = read.solved().step
         total = float(read.cost.sum() + read.b.sum(axis=0) @ d)
         if 2 * turned.sum() <= N and total < least:
             best, least = (turned, d), total
@@ -465,9 +464,7 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
         if views - len(why) >= _LEAST_VIEWS:
             usable = np.flatnonzero([i not in why for i in range(views)])
             part = replace(
-                whole,
-                observations=whole.observations.select(usable),
-                block=whole.block.part(usable),
+                whole, observations=whole.observations.select(usable), block=whole.block.part(usable)
             )
             asked = agreement(part, None if robust and turn < 2 else kept[usable])
             scale_px = asked.scale_px

@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray
+from calib.core.arrays import BoolArray, FloatArray, evenly
 from calib.core.geometry import box_grid
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.core.words import several
@@ -831,16 +831,14 @@ def _focal_share(fit: bundle.Calibration, known: bundle.Covariance) -> float:
 
 def _sampled(fit: bundle.Calibration) -> bundle.Calibration:
     views = fit.observations.views
-    if views <= _SAMPLE:
-        return fit
-    return bundle.refitted(fit, np.unique(np.linspace(0, views - 1, _SAMPLE).astype(np.int64)))
+    return fit if views <= _SAMPLE else bundle.refitted(fit, evenly(views, _SAMPLE))
 
 
 def _next_picture(fit: bundle.Calibration, verdict: Verdict) -> Iterator[Finding]:
     width = max(fit.camera.image_size_px)
     if not 0.2 * width < min(fit.camera.fx_px, fit.camera.fy_px) < 50 * width:
         return
-    plan = checks.best_next_view(fit, checks.evidence(fit).S.sum(axis=0))
+    plan = checks.best_next_view(fit)
     if plan is None:
         return
     best = plan.best
