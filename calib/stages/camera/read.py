@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -544,7 +545,6 @@ COLUMNS = ("view", "x_m", "y_m", "u_px", "v_px")
 """Columns that a correspondence table must have."""
 
 _FEWEST = 4
-_LONGEST_LINE = 65536
 
 
 def _at(path: Path, line: int, what: str) -> BadInputError:
@@ -581,28 +581,18 @@ class _Points:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines of a text file, without their ends; never more than one line in memory.
 
-    Raises
-    ------
-    BadInputError
-        For files that cannot be opened, are not UTF-8 text, or have lines of absurd length.
+    Raises `BadInputError` for files that cannot be opened or are not UTF-8 text.
     """
-    with to_be("read", path), path.open("rb") as file:
-        number = 0
-        while raw := file.readline(_LONGEST_LINE):
-            number += 1
-            if b"\0" in raw:
+    with to_be("read", path), path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
+        for number, text in enumerate(file, 1):
+            if "\0" in text:
                 raise BadInputError(
                     f"{shown(path)}: line {number} has a zero byte; expected a text file, not binary data"
                 )
-            if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
-                raise BadInputError(f"{shown(path)}: line {number} has more than {_LONGEST_LINE} characters")
-            try:
-                text = raw.decode("utf-8-sig" if number == 1 else "utf-8")
-            except UnicodeDecodeError as error:
-                raise BadInputError(
-                    f"{shown(path)}: line {number} is not UTF-8 text (byte 0x{raw[error.start]:02x})"
-                ) from error
-            yield number, text.rstrip("\r\n")
+            if odd := re.search("[\udc80-\udcff]", text):
+                byte = ord(odd[0]) - 0xDC00
+                raise BadInputError(f"{shown(path)}: line {number} is not UTF-8 text (byte 0x{byte:02x})")
+            yield number, text.rstrip("\n")
 
 
 def _number(text: str, path: Path, line: int, column: str) -> float:

@@ -311,9 +311,7 @@ def _places(q: _Float32, win: _Windows) -> _Places:
     return _Places(x, y, t1, t2, n1, n2, n1 - half * kappa * t1 * t1, n2 + half * lam * t2 * t2, w)
 
 
-def _model(
-    q: _Float32, win: _Windows, room: _Float32, halo_px: float, moved: bool
-) -> tuple[_Float32, _Float32]:
+def _model(q: _Float32, win: _Windows, room: _Float32, part: Part) -> tuple[_Float32, _Float32]:
     """Residuals (N, M) and the Jacobian of the model (N, P, M), in `room`, both zero outside the window."""
     _, _, alpha, beta, _, b, a, gx, gy, kappa, lam = (q[:, k, None] for k in range(_PARAMETERS))
     x, y, t1, t2, n1, n2, d1, d2, w = _places(q, win)
@@ -322,13 +320,13 @@ def _model(
     P, P1, P2, Pw = _crossing(d1, d2, w)
     J = room[: len(q)]
     light = (1.0 + gx * x + gy * y) * win.weight
-    if halo_px:
-        h, wide = q[:, _PARAMETERS, None], np.sqrt(w * w + np.float32(2.0 * halo_px**2))
+    if part.halo_px:
+        h, wide = q[:, _PARAMETERS, None], np.sqrt(w * w + np.float32(2.0 * part.halo_px**2))
         Q, Q1, Q2, Qw = _crossing(d1, d2, wide)
         J[:, _PARAMETERS] = a * light * (P - Q)
         P, P1, P2 = P + h * (P - Q), P1 + h * (P1 - Q1), P2 + h * (P2 - Q2)
         Pw = Pw + h * (Pw - Qw * (w / wide))
-    if moved:
+    if part.moved:
         z1, z2, two = d1 / w, d2 / w, np.float32(2.0)
         bell = np.float32(2.0 / np.pi) * np.exp(-z1 * z1 - z2 * z2)
         J[:, _PARAMETERS] = a * light * bell
@@ -430,8 +428,7 @@ def _fit_part(
     warm: LocalFit | None,
     part: Part,
 ) -> LocalFit:
-    halo_px, moved = part.halo_px, part.moved
-    N, P = len(points), _PARAMETERS + (halo_px > 0.0 or moved)
+    N, P = len(points), _PARAMETERS + (part.halo_px > 0.0 or part.moved)
     room = np.empty((N, P, win.x.shape[1]), dtype=np.float32)
     q = _start(points, frames, win, P)
     # Weight of the further observations, for residuals of the size that the fit will leave.
@@ -446,7 +443,7 @@ def _fit_part(
             q[kept, _PARAMETERS] = warm.parameters[kept, _PARAMETERS]
     freedom = np.maximum(win.weight.sum(axis=1).astype(np.float64) - P, 1.0)
     damping, converged = np.full(N, 1e-3), np.zeros(N, dtype=bool)
-    r, J = _model(q.astype(np.float32), win, room, halo_px, moved)
+    r, J = _model(q.astype(np.float32), win, room, part)
     normal, gradient, cost = _equations(q, r, J, prior, observed)
     active = np.arange(N)
     diagonal = np.arange(P)
@@ -461,7 +458,7 @@ def _fit_part(
         foreseen = np.einsum("ni,ni->n", step, 2.0 * g_a - np.einsum("nij,nj->ni", N_a, step))
         trial = q[active] + step
         some = win.take(active) if len(active) < N else win
-        r, J = _model(trial.astype(np.float32), some, room, halo_px, moved)
+        r, J = _model(trial.astype(np.float32), some, room, part)
         equations = _equations(trial, r, J, prior[active], observed[active])
         gain = (cost[active] - equations[2]) / np.maximum(foreseen, 1e-9)
         better = equations[2] <= cost[active] * (1 + 1e-6)
@@ -469,7 +466,7 @@ def _fit_part(
         settled = (length < _STEP_PX) | (foreseen * freedom[active] < _STEP_SIGMA**2 * cost[active])
         won = active[better]
         q[won] = trial[better]
-        normal[won], gradient[won], cost[won] = (part[better] for part in equations)
+        normal[won], gradient[won], cost[won] = (one[better] for one in equations)
         factor = np.where(gain > 0.75, 0.1, np.where(gain > 0.25, 1.0, 6.0))
         damping[active] = np.clip(damping[active] * factor, 1e-7, 1e8)
         converged[active] = better & settled & (damping[active] < 1e3)
