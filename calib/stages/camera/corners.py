@@ -318,9 +318,9 @@ def surroundings(grid: Refined) -> tuple[list[bool], list[bool]]:
 
 _COARSE_PIXELS = 120_000
 _LARGEST_PIXELS = 6_000_000
-_ENLARGE_BELOW_PIXELS = 700_000
+_ENLARGED = ((2.0, 700_000), (4.0, 90_000))
+"""Zooms of small pictures, and the number of pixels below which they are tried."""
 _QUICK_PIXELS = 400_000
-_ENLARGE_TWICE_BELOW_PIXELS = 90_000
 _OPENCV_PIXELS = 1_300_000
 """Of a picture that OpenCV's finders can search quickly."""
 _SEEN_SHARE = 0.8
@@ -357,19 +357,10 @@ def resized(gray: GrayImage, zoom: float) -> Level:
 
 def lattice_levels(gray: GrayImage) -> list[float]:
     """Zooms at which to look for grids of saddle points, in order."""
-    zooms: list[float] = []
-    n = 1
-    while gray.size / n**2 > _COARSE_PIXELS:
-        n *= 2
-    while n >= 1:
-        if gray.size / n**2 <= _LARGEST_PIXELS:
-            zooms.append(1.0 / n)
-        n //= 2
-    if gray.size < _ENLARGE_BELOW_PIXELS:
-        zooms.append(2.0)
-    if gray.size < _ENLARGE_TWICE_BELOW_PIXELS:
-        zooms.append(4.0)
-    return zooms
+    halvings = max(0, math.ceil(0.5 * math.log2(gray.size / _COARSE_PIXELS)))
+    copies = (0.5**n for n in range(halvings, -1, -1))
+    zooms = [zoom for zoom in copies if gray.size * zoom**2 <= _LARGEST_PIXELS]
+    return zooms + [zoom for zoom, most in _ENLARGED if gray.size < most]
 
 
 def complete(lattice: Lattice) -> FloatArray | None:

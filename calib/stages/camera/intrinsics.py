@@ -323,8 +323,7 @@ def candidates_by_board(rigid: Calibration) -> list[tuple[Candidate, Calibration
     Only for targets whose points are the same in every view; otherwise the rigid board alone.
     """
     observations = rigid.observations
-    names: list[str] = []
-    fits: list[Calibration] = []
+    fits: dict[str, Calibration] = {}
     for kind in BOARDS:
         if kind != "rigid" and not observations.same_target:
             continue
@@ -336,12 +335,10 @@ def candidates_by_board(rigid: Calibration) -> list[tuple[Candidate, Calibration
         ):
             continue
         fit = rigid if basis is None else refitted(rigid, basis=basis, fixed=())
-        if fit.termination in ("behind the camera", "singular"):
-            continue
-        names.append(kind)
-        fits.append(fit)
-    held = _on_held_back(fits)
-    return [(_candidate(names[i], fit, held[i]), fit) for i, fit in enumerate(fits)]
+        if fit.termination not in ("behind the camera", "singular"):
+            fits[kind] = fit
+    held = _on_held_back(list(fits.values()))
+    return [(_candidate(kind, fit, one), fit) for (kind, fit), one in zip(fits.items(), held, strict=True)]
 
 
 def simplest_good(candidates: Sequence[Candidate], scale: float = 1.0) -> int:

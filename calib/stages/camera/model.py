@@ -10,6 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from calib.core.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from calib.core.geometry import box_grid
 
 # ----------------------------------------------------------------------
 # The checkerboard: inner corners on a plane, in metres.
@@ -425,9 +426,7 @@ def focal_px(camera: Camera) -> float:
 def corner_radius(camera: Camera) -> float:
     """Largest normalised radius of the picture's corners, distorted, and no farther than `ahead_radius`."""
     width, height = camera.image_size_px
-    v = np.array([0.0, 0.0, height - 1.0, height - 1.0])
-    u = np.array([0.0, width - 1.0, 0.0, width - 1.0])
-    corners = distorted_normalised(camera, np.stack([u, v], axis=1))
+    corners = distorted_normalised(camera, box_grid((0.0, 0.0, width - 1.0, height - 1.0), 2, 2))
     return min(float(np.hypot(*corners.T).max()), ahead_radius(camera))
 
 

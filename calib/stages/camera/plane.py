@@ -195,8 +195,7 @@ def compare_pictures(
     """Fit every picture by itself and test whether the camera stood still."""
     fits: list[PictureFit] = []
     tested: list[tuple[float, float, int]] = []
-    ends = np.cumsum([len(view.pixels) for view in views])[:-1]
-    for view, residuals in zip(views, np.split(pose.residuals_px, ends), strict=True):
+    for view, residuals in _by_view(views, pose.residuals_px):
         moved, squared = np.nan, np.sum(residuals**2, axis=1)
         with suppress(BadInputError):
             own = fit_pose(camera, view.target_m, view.pixels)
@@ -215,6 +214,12 @@ def compare_pictures(
     return tuple(fits), Comparison(probability, worst.moved_px, worst.name, max(inflation, 1.0))
 
 
+def _by_view(views: Sequence[View], residuals_px: FloatArray) -> Iterator[tuple[View, FloatArray]]:
+    """Each view with its own of the residuals (M, 2) of all in turn."""
+    ends = np.cumsum([len(view.pixels) for view in views])[:-1]
+    return zip(views, np.split(residuals_px, ends), strict=True)
+
+
 def _alike(views: Sequence[View], residuals_px: FloatArray) -> float:
     """Factor on the pose's covariance for residuals (M, 2) that are alike at neighbouring corners.
 
@@ -222,8 +227,7 @@ def _alike(views: Sequence[View], residuals_px: FloatArray) -> float:
     along both sides as 1 of ((1 + r) / (1 - r))^2, at least as many as the pose has unknowns.
     """
     products = squares = 0.0
-    ends = np.cumsum([len(view.pixels) for view in views])[:-1]
-    for view, own in zip(views, np.split(residuals_px, ends), strict=True):
+    for view, own in _by_view(views, residuals_px):
         apart = np.linalg.norm(view.target_m[:, None] - view.target_m, axis=2)
         np.fill_diagonal(apart, np.inf)
         i, j = np.nonzero(apart < _NEIGHBOURS * apart.min())
@@ -550,7 +554,7 @@ def calibrate_plane(
     *,
     workspace_m: tuple[float, float, float, float] | None = None,
     camera_rms_px: float | None = None,
-    placed: BoardPlace | None = None,
+    placed: BoardPlace = BoardPlace((0.0, 0.0)),
 ) -> Plane:
     """Fit one pose of the world's plane to all pictures of it, taken by a camera that stands still.
 
@@ -574,13 +578,9 @@ def calibrate_plane(
     pose = fit_pose(camera, world_m, pixels, _same_points(world_m))
     pictures, comparison = compare_pictures(camera, views, pose)
     inflation = max(comparison.inflation, _alike(views, pose.residuals_px))
-    placing = np.zeros((6, 6)) if placed is None else placed.covariance(pose.R_CW)
-    pose = replace(pose, covariance=pose.covariance * inflation + placing)
-
-    box = workspace_m
-    if box is None:
-        low, high = world_m.min(axis=0), world_m.max(axis=0)
-        box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    pose = replace(pose, covariance=pose.covariance * inflation + placed.covariance(pose.R_CW))
+    low, high = world_m.min(axis=0).tolist(), world_m.max(axis=0).tolist()
+    box = workspace_m or (low[0], low[1], high[0], high[1])
     sigma = position_sigma(camera, camera_covariance, pose, geometry.box_grid(box, 9, 9).reshape(-1, 2))
     direct = geometry.fit_homography(world_m, pixels)
     read_m = plane_map(camera, pose.R_CW, pose.t_CW_m, pixels)

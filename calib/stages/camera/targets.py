@@ -164,13 +164,14 @@ def _share(board: FloatArray, step: FloatArray) -> tuple[float, BoolArray]:
 
 def in_place(markers: Markers, layout: Layout) -> tuple[Markers, float]:
     """Markers that agree with most of their neighbours, and their side over that of a square."""
+    none = markers.take(np.zeros(len(markers.ids), dtype=np.bool_)), 0.0
     if len(markers.ids) < 2:
-        return markers.take(np.zeros(len(markers.ids), dtype=np.bool_)), 0.0
+        return none
     i, j, step = _steps(markers)
     places = layout.places(markers.ids)
     share, good = _share((places[j] - places[i]).astype(np.float64), step)
     if not _MARKER_SHARE[0] < share < _MARKER_SHARE[1]:
-        return markers.take(np.zeros(len(markers.ids), dtype=np.bool_)), 0.0
+        return none
     count = len(markers.ids)
     votes = np.bincount(i, good, count) + np.bincount(j, good, count)
     kept = votes > 0.5 * (np.bincount(i, minlength=count) + np.bincount(j, minlength=count))

@@ -773,13 +773,13 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     findings += _of_misfit(fit)
     sturdy = checks.conditioned(fit)
     if sturdy is not fit:
-        findings += _of_denominator(_focal_share(fit, bundle.covariance(fit)))
+        findings += _of_denominator(_focal_share(fit))
     inflation = checks.overdispersion(checks.evidence(sturdy))
     # What a board of another shape moves is a matter of the board, and told of that.
-    share = _focal_share(sturdy, bundle.covariance(sturdy))
+    share = _focal_share(sturdy)
     if calibration.basis is not None:
         # A target that was deformed to fit costs certainty, which the rigid target in its shape hides.
-        share = max(share, _focal_share(calibration, bundle.covariance(calibration)))
+        share = max(share, _focal_share(calibration))
     findings += _of_focal(inflation * share)
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
@@ -823,9 +823,9 @@ def _plain(calibration: bundle.Calibration) -> bundle.Calibration:
     return bundle.refitted(calibration, observations=shaped, start=start, basis=None, loss="none")
 
 
-def _focal_share(fit: bundle.Calibration, known: bundle.Covariance) -> float:
+def _focal_share(fit: bundle.Calibration) -> float:
     """Larger relative standard deviation of the focal lengths."""
-    sigma = known.sigma()
+    sigma = bundle.covariance(fit).sigma()
     return max(sigma["fx_px"] / fit.camera.fx_px, sigma["fy_px"] / fit.camera.fy_px)
 
 
