@@ -25,15 +25,14 @@ from firmware_build import Built
 from scipy.signal import butter, sosfilt_zi
 
 from calib.stages.actuator.pump import settling_force_N
-from calib.stages.actuator.simulate import derivative, rig_at_rest
+from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.actuator.simulate import run as run_kernel
 from calib.twin.rig import SimulatedRig
 from calib.twin.sensors import (
-    HeadMotion,
     _read,
     draw_imu_noise,
     draw_tracker_noise,
-    head_rows,
+    head_motion,
     measure,
     track,
 )
@@ -133,10 +132,9 @@ class Board:
     def _sense(self, k: int) -> None:
         """What both sensors of the BNO055 feel, through the low-pass of each."""
         plant = self.plants[self.hoses_off]
-        rates = derivative(plant.c, self.row[:6], self.row[8], self.row[9])
-        ddq = np.zeros(2) if self.held else rates[2:4]
-        rows = head_rows(plant.c.r, self.row[None], ddq[None])
-        motion = HeadMotion(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:5], rows[:, 5:7])
+        motion = head_motion(plant.c, self.row[None])
+        if self.held:
+            motion = replace(motion, ddphi_radps2=np.zeros(1), acceleration_mps2=np.zeros((1, 2)))
         exact = replace(self.rig.imu, accel_step_mps2=0.0, gyro_step_radps=0.0)
         both = int(self._rig.rig_bandwidths())
         codes = (both >> 2 & 7, both >> 11 & 7)

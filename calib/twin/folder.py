@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
@@ -66,16 +65,6 @@ def _views(view: View) -> list[Shot]:
     return [*shots(camera), lying]
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return value
-
-
 def write_rig_folder(
     folder: Path,
     rig: SimulatedRig,
@@ -115,5 +104,7 @@ def _write(
         write_atomically(folder / written[-1], log_text(log_of(run, name)))
         if progress is not None:
             progress(index + 1, len(LOGS))
-    write_atomically(folder / "truth.json", json.dumps(_plain(asdict(rig)), indent=1) + "\n")
+    write_atomically(
+        folder / "truth.json", json.dumps(asdict(rig), indent=1, default=np.ndarray.tolist) + "\n"
+    )
     return written

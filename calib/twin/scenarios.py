@@ -17,9 +17,19 @@ from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.io.logs import Log
 from calib.stages.actuator.identify import decrement
+from calib.stages.actuator.kinematics import angle
 from calib.stages.actuator.simulate import RigState, rig_at_rest
-from calib.stages.control.laws import Channel, FeedForward, Pid, feed_forward, saturate
+from calib.stages.control.laws import (
+    ANGLE_PIDS,
+    LENGTHS_PD,
+    Channel,
+    FeedForward,
+    Pid,
+    feed_forward,
+    saturate,
+)
 from calib.stages.control.references import Ellipse, PolynomialElongation
+from calib.stages.control.tuning import settling_s
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
 from calib.twin.simulate import Law, Run, Seen, log_of, ticks_in
@@ -60,9 +70,8 @@ def step_response(tick_s: float, values: FloatArray, wanted: float) -> StepRespo
         i = int(above[0])
         part = 0.0 if i == 0 else (wanted - values[i - 1]) / (values[i] - values[i - 1])
         reach = float((i - 1 + part) * tick_s) if i else 0.0
-    outside = np.nonzero(np.abs(values - wanted) > _BAND * abs(wanted))[0]
-    last = int(outside[-1]) + 1 if len(outside) else 0
-    return StepResponse(reach, float(values.max()), last * tick_s if last < len(values) else None)
+    settle = settling_s(tick_s, values - wanted, _BAND * abs(wanted))
+    return StepResponse(reach, float(values.max()), settle)
 
 
 def fall_time_s(tick_s: float, values: FloatArray) -> float | None:
@@ -137,7 +146,7 @@ _PRBS = 3
 
 def _pwm(rig: SimulatedRig, volt: float) -> float:
     # 6 V is a PWM value of 127.5 in the source, so it is not rounded here.
-    supply = float(getattr(rig.pump.static, "supply_V", 12.0))
+    supply = rig.pump.static.supply_V
     if not 0.0 <= volt <= supply:
         raise BadInputError(f"found {volt:g} V for a motor, expected 0 to {supply:g}, its supply")
     return 255.0 * volt / supply
@@ -172,10 +181,10 @@ class SwingRelease(Scenario):
         return run_loop(rig, start, np.zeros((ticks, 2)), ticks, seed, feedback, rig.free_plant)
 
     def figures(self, run: Run) -> Figures:
-        t = run.trajectory.node_s * np.arange(len(run.trajectory.nodes), dtype=np.float64)
-        q = run.trajectory.nodes
+        nodes = run.trajectory.nodes
+        t = run.trajectory.node_s * np.arange(len(nodes), dtype=np.float64)
         try:
-            swing = decrement(t, (q[:, 0] - q[:, 1]) / (2.0 * run.plant.bellows_radius_m))
+            swing = decrement(t, angle(nodes[:, :2], run.plant.bellows_radius_m))
         except BadInputError:
             return {}
         figures: Figures = {"damping_ratio": swing.zeta, "frequency_hz": swing.frequency_hz}
@@ -275,18 +284,6 @@ class Prbs(Scenario):
 
 Pair = tuple[float, float]
 
-_ORIENTATION: dict[str, Pid] = {
-    "p": Pid(1000.0),
-    "pid": Pid(1000.0, 1000.0, 10.0),
-    "clamping": Pid(1000.0, 1000.0, 10.0, clamping=True),
-}
-_POSITION: dict[str, tuple[Pid, bool]] = {
-    "pd+ff": (Pid(15000.0, 0.0, 150.0), True),
-    "pd": (Pid(15000.0, 0.0, 150.0), False),
-    "pid": (Pid(15000.0, 8000.0, 150.0), False),
-}
-
-
 # Control of angle and of lengths (Fig. 4.1, 4.6, 4.10): one error and one PID controller for each
 # bellows, the feed-forward where there is one, and the limits:
 #
@@ -354,7 +351,7 @@ class Orientation(_Controlled):
     def drive(self, rig: SimulatedRig, ticks: int) -> Law:
         early = tick_times(rig, ticks) + 1e-9 < self.jump_at_s
         wanted = np.where(early, self.reference_rad, self.jump_to_rad)
-        return angle_law(self._tuned(rig, _ORIENTATION[self.controller]), wanted, self.sign)
+        return angle_law(self._tuned(rig, ANGLE_PIDS[self.controller]), wanted, self.sign)
 
     def figures(self, run: Run) -> Figures:
         jump = max(min(round(self.jump_at_s / run.tick_s), len(run.pwm)), 1)
@@ -389,9 +386,9 @@ class Elongation(_Controlled):
         return rig_at_rest(rig.plant, rig.pump, length_m=self.start_m)
 
     def drive(self, rig: SimulatedRig, ticks: int) -> Law:
-        pid, feed = _POSITION[self.controller]
+        pid = replace(LENGTHS_PD, Ki=8000.0 if self.controller == "pid" else 0.0)
         wanted = PolynomialElongation().bellows_m(tick_times(rig, ticks))
-        return length_law(self._tuned(rig, pid), wanted, _line(wanted, feed))
+        return length_law(self._tuned(rig, pid), wanted, _line(wanted, self.controller == "pd+ff"))
 
     def figures(self, run: Run) -> Figures:
         error = _errors_mm(run, PolynomialElongation().bellows_m(run.t_s))
@@ -423,10 +420,7 @@ class EllipseTrack(Scenario):
         error = _errors_mm(run, self._wanted(run.rig, run.t_s))[run.t_s >= 2.0]
         if not len(error):
             return {}
-        return {
-            "rms_error_q1_mm": rms(error[:, 0]),
-            "rms_error_q2_mm": rms(error[:, 1]),
-        }
+        return {"rms_error_q1_mm": rms(error[:, 0]), "rms_error_q2_mm": rms(error[:, 1])}
 
 
 # ----------------------------------------------------------------------

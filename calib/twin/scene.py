@@ -11,7 +11,7 @@ import numpy as np
 from calib.core.arrays import FloatArray, GrayImage, IntArray
 from calib.core.errors import BadInputError
 from calib.stages.camera.model import Board, Camera, project, undistort
-from calib.twin.sensors import gaussian_noise, uniform
+from calib.twin.sensors import normal, uniform
 
 # ----------------------------------------------------------------------
 # The printed sheet in front of a camera: its pose, where rays meet it, and what colour it has there.
@@ -511,8 +511,7 @@ def expose(
 def quantise(grey: FloatArray, noise_grey: float, seed: int) -> GrayImage:
     """Add seeded sensor noise and round to 8 bits, clipping at 0 and 255."""
     if noise_grey > 0.0:
-        shape = (grey.shape[0], grey.shape[1])
-        grey = grey + noise_grey * gaussian_noise(np.random.PCG64(seed), shape)
+        grey = grey + noise_grey * normal(np.random.PCG64(seed), *grey.shape)
     return np.clip(np.floor(grey + 0.5), 0.0, 255.0).astype(np.uint8)
 
 

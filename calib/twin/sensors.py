@@ -10,9 +10,8 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.compilation import kernel
 from calib.core.geometry import in_picture
-from calib.stages.actuator.dynamics import Coefficients
+from calib.stages.actuator.dynamics import Coefficients, rates
 from calib.stages.actuator.kinematics import chord_decay_w, chord_ratio_w, forward, marker_from_head
-from calib.stages.actuator.simulate import derivative
 from calib.stages.camera.model import Camera, project
 from calib.twin.section import Imu, Tracker
 
@@ -32,16 +31,16 @@ def uniform(bits: np.random.PCG64, count: int) -> FloatArray:
     return (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-def gaussian_noise(bits: np.random.PCG64, shape: tuple[int, int]) -> FloatArray:
-    """Normal noise of mean 0 and deviation 1: standardised sums of 16 random bytes, an exact integer sum.
+def normal(bits: np.random.PCG64, rows: int, columns: int = 1) -> FloatArray:
+    """Normal numbers (rows, columns) of mean 0 and deviation 1: standardised sums of 16 random bytes.
 
-    The tails end at 6.9 and the excess kurtosis is -0.075, which no picture of 256 levels can show.
+    The sums are exact. The tails end at 6.9 and the excess kurtosis is -0.075, which no picture of 256 levels
+    can show.
     """
-    words = np.asarray(bits.random_raw(shape[0] * shape[1] * _BYTES_PER_NORMAL // 8), dtype="<u8")
-    total = words.view(np.uint8).reshape(*shape, _BYTES_PER_NORMAL).sum(axis=-1, dtype=np.int64)
+    words = np.asarray(bits.random_raw(rows * columns * _BYTES_PER_NORMAL // 8), dtype="<u8")
+    total = words.view(np.uint8).reshape(rows, columns, _BYTES_PER_NORMAL).sum(axis=-1, dtype=np.int64)
     deviation = math.sqrt(_BYTES_PER_NORMAL * (256**2 - 1) / 12)
-    noise: FloatArray = (total - _BYTES_PER_NORMAL * 127.5) / deviation
-    return noise
+    return np.asarray((total - _BYTES_PER_NORMAL * 127.5) / deviation)
 
 
 # ----------------------------------------------------------------------
@@ -56,13 +55,13 @@ def gaussian_noise(bits: np.random.PCG64, shape: tuple[int, int]) -> FloatArray:
 #     rho' = dl S + l S' dphi,   rho'' = ddl S + 2 dl S' dphi + l (S'' dphi^2 + S' ddphi),
 #     S' = -phi D,   S'' = 2 D - S / 4.
 
-MOTION = ("phi_rad", "dphi_radps", "ddphi_radps2", "x_m", "y_m", "ax_mps2", "ay_mps2")
-"""Columns of `head_rows`, in the world frame."""
-
 
 @kernel()
 def states_between(node_s: float, nodes: FloatArray, t_s: FloatArray) -> FloatArray:
-    """States (m, 10) at the times (m,) from nodes (n, 10); see `sensors.Trajectory`."""
+    """States (m, 10) at the times (m,) from nodes (n, 10), those outside of them held.
+
+    Lengths follow the cubic through lengths and rates of both nodes, rates its derivative, the rest a line.
+    """
     last = len(nodes) - 1
     out = np.empty((len(t_s), nodes.shape[1]))
     for row in range(len(t_s)):
@@ -90,14 +89,15 @@ def states_between(node_s: float, nodes: FloatArray, t_s: FloatArray) -> FloatAr
 
 
 @kernel()
-def head_rows(r: float, states: FloatArray, ddq: FloatArray) -> FloatArray:
-    """Motion (m, 7) of the head, see `MOTION`, from states (m, 10) and accelerations (m, 2) [m/s^2]."""
-    out = np.empty((len(states), 7))
-    for row in range(len(states)):
-        q1, q2, dq1, dq2 = states[row, 0], states[row, 1], states[row, 2], states[row, 3]
-        phi, length = (q1 - q2) / (2.0 * r), 0.5 * (q1 + q2)
-        dphi, dl = (dq1 - dq2) / (2.0 * r), 0.5 * (dq1 + dq2)
-        ddphi, ddl = (ddq[row, 0] - ddq[row, 1]) / (2.0 * r), 0.5 * (ddq[row, 0] + ddq[row, 1])
+def _head_rows(c: Coefficients, states: FloatArray) -> FloatArray:
+    """Angle with its derivatives, and acceleration, as rows (5, m), of the head in the states (m, 10)."""
+    out, half = np.empty((5, len(states))), 0.5 / c.r
+    for k in range(len(states)):
+        q1, q2, dq1, dq2 = states[k, 0], states[k, 1], states[k, 2], states[k, 3]
+        z1, z2, F1, F2 = states[k, 4], states[k, 5], states[k, 8], states[k, 9]
+        phi, length = half * (q1 - q2), 0.5 * (q1 + q2)
+        dphi, dl = half * (dq1 - dq2), 0.5 * (dq1 + dq2)
+        ddl, ddphi, _, _ = rates(c, length, phi, dl, dphi, z1 + z2, z1 - z2, F1, F2)
         S, D = chord_ratio_w(phi * phi), chord_decay_w(phi * phi)
         S1, S2 = -phi * D, 2.0 * D - 0.25 * S
         rho = length * S
@@ -106,10 +106,8 @@ def head_rows(r: float, states: FloatArray, ddq: FloatArray) -> FloatArray:
         along = ddrho - 0.25 * rho * dphi * dphi
         across = 0.5 * rho * ddphi + drho * dphi
         sine, cosine = math.sin(0.5 * phi), math.cos(0.5 * phi)
-        out[row, 0], out[row, 1], out[row, 2] = phi, dphi, ddphi
-        out[row, 3], out[row, 4] = rho * sine, rho * cosine
-        out[row, 5] = along * sine + across * cosine
-        out[row, 6] = along * cosine - across * sine
+        out[0, k], out[1, k], out[2, k] = phi, dphi, ddphi
+        out[3, k], out[4, k] = along * sine + across * cosine, along * cosine - across * sine
     return out
 
 
@@ -129,11 +127,6 @@ def stream(seed: int, *purpose: int) -> np.random.PCG64:
     """Random bits for one purpose; other purposes and seeds have streams of their own."""
     # Not a tuple as the seed: zeros at its end count for nothing.
     return np.random.PCG64(np.random.SeedSequence(seed, spawn_key=purpose))
-
-
-def normal(bits: np.random.PCG64, rows: int, columns: int = 1) -> FloatArray:
-    """Normal numbers (rows, columns) of mean 0 and deviation 1, the same on every machine."""
-    return gaussian_noise(bits, (rows, columns))
 
 
 @dataclass(frozen=True)
@@ -161,23 +154,19 @@ class HeadMotion:
     Attributes
     ----------
     phi_rad, dphi_radps, ddphi_radps2 : (m,) angle and its derivatives.
-    position_m, acceleration_mps2 : (m, 2).
+    acceleration_mps2 : (m, 2).
     """
 
     phi_rad: FloatArray
     dphi_radps: FloatArray
     ddphi_radps2: FloatArray
-    position_m: FloatArray
     acceleration_mps2: FloatArray
 
 
 def head_motion(c: Coefficients, states: FloatArray) -> HeadMotion:
     """Motion of the head (m) in the states (m, 10), accelerations by the equations of motion."""
-    ddq = np.empty((len(states), 2))
-    for i, row in enumerate(states):
-        ddq[i] = derivative(c, row[:6], row[8], row[9])[2:4]
-    rows = head_rows(c.r, states, ddq)
-    return HeadMotion(rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:5], rows[:, 5:7])
+    rows = _head_rows(c, states)
+    return HeadMotion(rows[0], rows[1], rows[2], rows[3:].T)
 
 
 def stamps(t_s: FloatArray, jitter_s: float, duplicated: float, bits: np.random.PCG64) -> FloatArray:

@@ -12,7 +12,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
 from calib.io.logs import Log
 from calib.stages.actuator.dynamics import Coefficients, coefficients
-from calib.stages.actuator.kinematics import forward
+from calib.stages.actuator.kinematics import angle, forward
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import delayed, pump_coefficients, settling_force_N
 from calib.stages.actuator.simulate import STATE, RigState, check_start, largest_step_s
@@ -108,7 +108,7 @@ class Run:
     @property
     def phi_rad(self) -> FloatArray:
         """True angle (n,) [rad] at the ticks."""
-        return (self.states[:, 0] - self.states[:, 1]) / (2.0 * self.plant.bellows_radius_m)
+        return angle(self.states[:, :2], self.plant.bellows_radius_m)
 
 
 class _Plant:
@@ -208,11 +208,6 @@ class _Eyes:
         return Seen(phi, (q1, q2), (u, v), imu)
 
 
-def _truth(row: FloatArray, bellows_radius_m: float) -> Seen:
-    q1, q2 = row[:2].tolist()
-    return Seen((q1 - q2) / (2.0 * bellows_radius_m), (q1, q2))
-
-
 def _close_loop(
     plant: _Plant, law: Law, start: RigState, nodes: FloatArray, eyes: _Eyes | None, ticks: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -223,7 +218,8 @@ def _close_loop(
     for k in range(ticks):
         here = per * k
         if eyes is None:
-            view = _truth(nodes[here], plant.c.r)
+            q1, q2 = nodes[here, :2].tolist()
+            view = Seen(float(angle(nodes[here, :2], plant.c.r)), (q1, q2))
         else:
             view = eyes.look(k, Trajectory(node_s, nodes[: here + 1]))
         pwm[k] = command = law(k, view)

@@ -675,7 +675,7 @@ def _head_motion(rows: FloatArray) -> HeadMotion:
 
     five = [place(k * h) for k in (-2, -1, 0, 1, 2)]
     a = (-five[0] + 16.0 * five[1] - 30.0 * five[2] + 16.0 * five[3] - five[4]) / (12.0 * h * h)
-    return HeadMotion(rows[:, 0], rows[:, 2], rows[:, 4], five[2], a)
+    return HeadMotion(rows[:, 0], rows[:, 2], rows[:, 4], a)
 
 
 @pytest.mark.parametrize("package", [calib.stages.estimator, calib.stages.actuator])

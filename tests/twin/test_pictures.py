@@ -30,7 +30,7 @@ from calib.twin.scene import (
     pose_facing,
     render,
 )
-from calib.twin.sensors import gaussian_noise
+from calib.twin.sensors import normal
 
 PRINTED = PrintedBoard(BOARD)
 
@@ -272,7 +272,7 @@ def test_rays_of_projected_corners_meet_the_sheet_in_the_corners(bow_m: tuple[fl
 
 
 def test_noise_is_standard_normal() -> None:
-    noise = gaussian_noise(np.random.PCG64(1), (400, 500)).ravel()
+    noise = normal(np.random.PCG64(1), 400, 500).ravel()
     assert abs(noise.mean()) < 4.0 / np.sqrt(noise.size)
     assert abs(noise.var() - 1.0) < 4.0 * np.sqrt(2.0 / noise.size)
     assert abs(stats.kurtosis(noise) - (-1.2 / 16)) < 0.05

@@ -17,13 +17,12 @@ from calib.core.geometry import apply_homography
 from calib.stages.actuator.dynamics import coefficients
 from calib.stages.actuator.kinematics import forward, forward_jacobian, forward_jacobian_rate
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.simulate import state_row
+from calib.stages.actuator.simulate import derivative, state_row
 from calib.stages.control.references import Ellipse
 from calib.stages.estimator.baseline import Baseline, BaselineSetup, undistorting_nothing
 from calib.stages.estimator.kinematic import Rows
 from calib.twin.rig import nominal_view
 from calib.twin.sensors import (
-    MOTION,
     HeadMotion,
     Imu,
     ImuNoise,
@@ -31,7 +30,6 @@ from calib.twin.sensors import (
     draw_imu_noise,
     draw_tracker_noise,
     head_motion,
-    head_rows,
     marker_pixels,
     measure,
     onchip_angle_rad,
@@ -55,7 +53,7 @@ def test_the_motion_of_a_swing_is_that_of_its_path() -> None:
     ):
         slope = (value[2:] - value[:-2]) / (2.0 * h)
         assert np.abs(slope - rate[1:-1])[inner].max() < 2e-4 * np.abs(rate).max()
-    path = motion.position_m
+    path = forward(fine.states[:, :2], plant.bellows_radius_m)[:, :2]
     second = (path[2:] - 2.0 * path[1:-1] + path[:-2]) / (h * h)
     assert np.abs(second - motion.acceleration_mps2[1:-1])[inner].max() < 2e-3
     # As much as gravity, as a swing at 4 Hz must be.
@@ -160,7 +158,7 @@ CLEAN_IMU_SENSOR = Imu(
 
 def _still_imu_sensor(phi: np.ndarray) -> HeadMotion:
     zero, flat = np.zeros_like(phi), np.zeros((len(phi), 2))
-    return HeadMotion(phi, zero, zero, flat, flat)
+    return HeadMotion(phi, zero, zero, flat)
 
 
 def _read(imu: Imu, motion: HeadMotion, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -171,9 +169,9 @@ def _read(imu: Imu, motion: HeadMotion, seed: int = 0) -> tuple[np.ndarray, np.n
 def test_its_axes_are_right_handed_and_x_points_to_the_base() -> None:
     # One motion at a time through phi = 0: up (-y) acceleration adds to x, +x acceleration to y.
     flat = np.zeros(1)
-    up = HeadMotion(flat, flat, flat, np.zeros((1, 2)), np.array([[0.0, -2.0]]))
-    right = HeadMotion(flat, flat, flat, np.zeros((1, 2)), np.array([[3.0, 0.0]]))
-    turning = HeadMotion(flat, np.ones(1), flat, np.zeros((1, 2)), np.zeros((1, 2)))
+    up = HeadMotion(flat, flat, flat, np.array([[0.0, -2.0]]))
+    right = HeadMotion(flat, flat, flat, np.array([[3.0, 0.0]]))
+    turning = HeadMotion(flat, np.ones(1), flat, np.zeros((1, 2)))
     assert _read(CLEAN_IMU_SENSOR, up)[0][0] == pytest.approx([11.81, 0.0, 0.0])
     assert _read(CLEAN_IMU_SENSOR, right)[0][0] == pytest.approx([9.81, 3.0, 0.0])
     assert _read(CLEAN_IMU_SENSOR, turning)[1][0] == pytest.approx([0.0, 0.0, -1.0])
@@ -187,7 +185,8 @@ def test_it_feels_the_acceleration_of_its_own_place_minus_gravity() -> None:
     force, rate = _read(imu, motion)
     # The sensor's place, rotated by SciPy: phi > 0 turns from y to x, which is negative about z.
     R_WH = Rotation.from_rotvec(np.outer(motion.phi_rad, [0.0, 0.0, -1.0])).as_matrix()
-    place = motion.position_m + (R_WH @ np.array([0.004, 0.009, 0.0]))[:, :2]
+    path = forward(fine.states[:, :2], plant.bellows_radius_m)[:, :2]
+    place = path + (R_WH @ np.array([0.004, 0.009, 0.0]))[:, :2]
     second = (place[2:] - 2.0 * place[1:-1] + place[:-2]) / (h * h)
     f_W = np.column_stack([second - np.array([0.0, 9.81]), np.zeros(len(second))])
     # At phi = 0 the columns of R_HS are the sensor's axes in the head's: (0, -1, 0), (1, 0, 0), (0, 0, 1).
@@ -206,7 +205,6 @@ def test_readings_are_whole_steps_within_the_range() -> None:
         np.linspace(-1.0, 1.0, 101),
         np.linspace(-60.0, 60.0, 101),
         np.zeros(101),
-        np.zeros((101, 2)),
         np.linspace(-80.0, 80.0, 202).reshape(101, 2),
     )
     force, rate = _read(imu, fast)
@@ -295,18 +293,17 @@ def test_accelerations_are_those_of_the_jacobian_and_its_rate(bend: float) -> No
     states = np.zeros((n, 10))
     states[:, 0], states[:, 1] = length + half, length - half
     states[:, 2:4] = 0.3 * rng.normal(size=(n, 2))
-    ddq = 20.0 * rng.normal(size=(n, 2))
+    states[:, 8:] = rng.uniform(0.0, 1.5, (n, 2))
+    c = coefficients(replace(Plant(), bellows_radius_m=RADIUS_M_KERNEL))
+    ddq = np.array([derivative(c, y[:6], *y[8:])[2:4] for y in states])
     q, dq = states[:, :2], states[:, 2:4]
-    rows = head_rows(RADIUS_M_KERNEL, states, ddq)
-    pose = forward(q, RADIUS_M_KERNEL)
+    motion = head_motion(c, states)
     J, rate = forward_jacobian(q, RADIUS_M_KERNEL), forward_jacobian_rate(q, dq, RADIUS_M_KERNEL)
     expected = np.einsum("nij,nj->ni", J, ddq) + np.einsum("nij,nj->ni", rate, dq)
-    assert rows.shape == (n, len(MOTION))
-    assert np.allclose(rows[:, 3:5], pose[:, :2], rtol=0.0, atol=1e-15)
-    assert np.allclose(rows[:, 0], pose[:, 2], rtol=0.0, atol=1e-12)
-    assert np.allclose(rows[:, 1], np.einsum("nij,nj->ni", J, dq)[:, 2], rtol=1e-12)
-    assert np.allclose(rows[:, 2], expected[:, 2], rtol=1e-10, atol=1e-8)
-    assert np.allclose(rows[:, 5:7], expected[:, :2], rtol=1e-10, atol=1e-9)
+    assert np.allclose(motion.phi_rad, forward(q, RADIUS_M_KERNEL)[:, 2], rtol=0.0, atol=1e-12)
+    assert np.allclose(motion.dphi_radps, np.einsum("nij,nj->ni", J, dq)[:, 2], rtol=1e-12)
+    assert np.allclose(motion.ddphi_radps2, expected[:, 2], rtol=1e-10, atol=1e-8)
+    assert np.allclose(motion.acceleration_mps2, expected[:, :2], rtol=1e-10, atol=1e-9)
 
 
 RADIUS_M_FEEDBACK, D_M = 0.0126, 0.015

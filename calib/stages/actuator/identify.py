@@ -16,6 +16,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray, rms, robust_sigma
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding, Verdict
 from calib.solve.information import scaled_inverse, tied_groups
+from calib.stages.actuator.kinematics import bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.pump import ElongationForce, Orifice, Pump, RateLimit
@@ -228,8 +229,7 @@ class Start:
     def row(self, plant: Plant) -> FloatArray:
         """The row (10,) of `simulate.STATE`."""
         row = state_row(plant, self.phi_rad, self.length_m, (self.force1_N, self.force2_N))
-        turning = plant.bellows_radius_m * self.dphi_radps
-        row[2:4] = self.dlength_mps + turning, self.dlength_mps - turning
+        row[2:4] = bellows(self.dphi_radps, self.dlength_mps, plant.bellows_radius_m)
         row[4:8] = self.creep1_N, self.creep2_N, self.lag1_N, self.lag2_N
         return row
 
@@ -637,6 +637,21 @@ class Solution:
         """Estimated parameters by name."""
         return {name: float(v) for name, v in zip(self.problem.names, self.x, strict=False)}
 
+    @cached_property
+    def weights(self) -> FloatArray:
+        """Weight of each residual (rows,) under the robust cost."""
+        return weights(self.problem, self.residual)
+
+    @cached_property
+    def weighted(self) -> FloatArray:
+        """The derivatives (rows, size) times the weights."""
+        return self.J * self.weights[:, None]
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """Inverse of the information of all unknowns (size, size), for residuals of deviation one."""
+        return scaled_inverse(self.weighted.T @ self.J)
+
 
 def _robust(problem: Problem, r: FloatArray) -> FloatArray:
     """Cost of residuals (..., rows): soft-L1, of the priors the square, which nothing outruns."""
@@ -841,7 +856,7 @@ def fit_tracks(
     nominal: Machine,
     tracks: Sequence[Track],
     static_map: bool = False,
-    delay_s: float | None = None,
+    delay_s: float = CAMERA_DELAY_S,
     progress: Progress | None = None,
     stated: Mapping[str, float] | None = None,
     either_law: bool = False,
@@ -872,9 +887,7 @@ def fit_tracks(
     if not any(_moves(track) for track in tracks):
         raise _blind(dict.fromkeys(names, "the rig does not move"))
     known = values_of(nominal)
-    problem = Problem(nominal, tracks, names, {}, stated=stated or {})
-    if delay_s is not None:
-        problem = replace(problem, delay_s=delay_s)
+    problem = Problem(nominal, tracks, names, {}, delay_s, stated or {})
     fixed: dict[str, str] = {}
     x = first_guess(problem, known)
     residual, J = jacobian(problem, x)
@@ -1180,10 +1193,8 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
 
 def uncertainty(solution: Solution) -> Uncertainty:
     """Covariance of the parameters, the larger of the white one and the sandwich."""
-    problem, r, J = solution.problem, solution.residual, solution.J
-    P = len(problem.names)
-    w = weights(problem, r)
-    spans = problem.spans
+    problem, r, J, w = solution.problem, solution.residual, solution.J, solution.weights
+    P, spans = len(problem.names), problem.spans
     rows = spans[-1].stop
     scale = max(robust_sigma(r[:rows]), 1e-9)
     # The prior is known, the scale of the residuals is not.
@@ -1269,10 +1280,9 @@ def _between(solution: Solution, w: FloatArray, inverse: FloatArray, raised: Flo
 def colour_of(solution: Solution) -> tuple[Colour, ...]:
     """Whiteness of each log's whitened residuals, rows that are far off cut at three deviations."""
     out = []
-    w = weights(solution.problem, solution.residual)
     for track, span in zip(solution.problem.tracks, solution.problem.spans, strict=True):
         r = solution.residual[span].reshape(-1, 2)
-        far = float(np.mean((w[span].reshape(-1, 2) < 1.0 / 3.0).any(axis=1)))
+        far = float(np.mean((solution.weights[span].reshape(-1, 2) < 1.0 / 3.0).any(axis=1)))
         c = autocorrelation(r, min(_LAGS, max(len(r) - 2, 1)))
         out.append(
             Colour(
@@ -1345,7 +1355,7 @@ def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
         free[k, u.starts[k]] = False
         free[k, u.delays[k]] = u.delays.count(u.delays[k]) > 1
         kept[k, span], kept[k, len(J) - len(priors) :] = False, free[k, priors]
-    weighted = J * weights(problem, solution.residual)[:, None]
+    weighted = solution.weighted
     whole = weighted.T @ J
     curved = [whole - weighted[~rows].T @ J[~rows] for rows in kept]
     xs, residual = np.tile(solution.x, (count, 1)), np.tile(solution.residual, (count, 1))
@@ -1677,17 +1687,6 @@ _TYPICAL = (0.004, 0.0004)
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """An open-loop experiment: start, whether the hoses are on, and the commands over time."""
-
-    name: str
-    what: str
-    start: Start
-    hoses: bool
-    pwm: FloatArray
-
-
-@dataclass(frozen=True)
 class Prospect:
     """Relative standard deviations after one more experiment, and the worst of them."""
 
@@ -1698,40 +1697,43 @@ class Prospect:
     worst_relative: float
 
 
-def _experiments(rest_length_m: float, tick_s: float) -> Iterator[Experiment]:
-    """What `calib record --do` has a rig do, by its names there."""
+def _experiments(
+    rest_length_m: float, tick_s: float, noise: FloatArray
+) -> Iterator[tuple[Track, Start, str]]:
+    """What `calib record --do` has a rig do, by its names there: tracks yet without a head, starts, words.
+
+    Parameters
+    ----------
+    noise : (2,) standard deviations of angle [rad] and length [m].
+    """
     from calib.io.experiments import EXPERIMENTS, MOST_PWM
 
     for name, one in EXPERIMENTS.items():
-        t = tick_s * np.arange(round(one.seconds / tick_s))
+        t = tick_s * np.arange(round(one.seconds / tick_s), dtype=np.float64)
         shares = (
             np.zeros((len(t), 2)) if one.command is None else np.array(list(map(one.command, t.tolist())))
         )
-        start = Start(0.5 if one.by_hand else 0.0, rest_length_m)
-        yield Experiment(name, f"{one.seconds:g} s, {one.asks}", start, not one.by_hand, MOST_PWM * shares)
+        W = np.broadcast_to(np.diag(1.0 / noise), (len(t) - 1, 2, 2)).copy()
+        track = Track(name, tick_s, MOST_PWM * shares, not one.by_hand, t[1:], np.zeros((len(t) - 1, 2)), W)
+        yield track, Start(0.5 if one.by_hand else 0.0, rest_length_m), f"{one.seconds:g} s, {one.asks}"
 
 
 def _information(
-    problem: Problem, names: tuple[str, ...], values: Mapping[str, float], one: Experiment, noise: FloatArray
+    problem: Problem, names: tuple[str, ...], values: Mapping[str, float], track: Track, start: Start
 ) -> FloatArray | None:
     """Information (P + 3, P + 3) about relative changes and what logs share, from one experiment.
 
     None where it leaves the model. What the experiment brings in that is not asked for, as the pumps'
     strength, is eliminated.
     """
-    tick_s = problem.nominal.pump.tick_s
-    n = len(one.pwm)
-    t = tick_s * np.arange(1, n, dtype=np.float64)
-    W = np.broadcast_to(np.diag(1.0 / noise), (n - 1, 2, 2)).copy()
-    track = Track(one.name, tick_s, one.pwm, one.hoses, t, np.zeros((n - 1, 2)), W)
     try:
-        head, _ = heads_of(track, [problem.pair(track, values)], [one.start], 0.0)
+        head, _ = heads_of(track, [problem.pair(track, values)], [start], 0.0)
     except BadInputError:
         return None
     if not np.isfinite(head).all():
         return None
     track = replace(track, head=head[0])
-    mine = candidates(problem.nominal, not one.hoses, one.hoses, False, problem.stated)
+    mine = candidates(problem.nominal, not track.hoses, track.hoses, False, problem.stated)
     more = tuple(name for name in mine if name not in names and name != "lambda3")
     if any(name.startswith("elongation") for name in names):
         more = tuple(name for name in more if name != "strength1")
@@ -1739,7 +1741,7 @@ def _information(
     flat = dict.fromkeys(PARAMETERS, math.inf)
     alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0, stated=flat)
     x = first_guess(alone, values)
-    x[alone.unknowns.starts[0]] = one.start.phi_rad, one.start.length_m
+    x[alone.unknowns.starts[0]] = start.phi_rad, start.length_m
     residual, J = jacobian(alone, x)
     shared = _shared(alone)
     J[alone.spans[-1].stop :, shared] = 0.0
@@ -1796,18 +1798,18 @@ def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
     W = np.concatenate([track.whitening for track in problem.tracks])
     inverse = np.linalg.inv(W)
     noise = known.scale * np.sqrt(np.median(np.sum(inverse**2, axis=2), axis=0))
-    noise = np.where(np.isfinite(noise) & (noise > 0.0), noise, np.array(_TYPICAL))
+    noise = np.asarray(np.where(np.isfinite(noise) & (noise > 0.0), noise, _TYPICAL))
     out = []
     rest = problem.nominal.plant.rest_length_m
-    for one in _experiments(rest, problem.nominal.pump.tick_s):
-        gained = _information(problem, names, values, one, noise)
+    for track, start, what in _experiments(rest, problem.nominal.pump.tick_s, noise):
+        gained = _information(problem, names, values, track, start)
         if gained is None:
             continue
         relative = _relative(now + gained, names)
         # What a drawing tells best is no reason for an experiment.
         asked = [name for name in names if math.isinf(PARAMETERS[name].share)] or names
         worst = max(asked, key=lambda n: relative[n])
-        out.append(Prospect(one.name, one.what, relative, worst, relative[worst]))
+        out.append(Prospect(track.name, what, relative, worst, relative[worst]))
     return tuple(sorted(out, key=lambda p: (p.worst_relative, sum(p.relative.values()))))
 
 
@@ -1912,10 +1914,7 @@ def _one_more(solution: Solution, columns: Iterable[FloatArray]) -> Iterator[tup
 
     One step of Gauss and Newton in which all other unknowns follow. None where they can make up for it.
     """
-    r, J = solution.residual, solution.J
-    w = weights(solution.problem, r)
-    WJ = J * w[:, None]
-    inverse = scaled_inverse(WJ.T @ J)
+    r, w, WJ, inverse = solution.residual, solution.weights, solution.weighted, solution.inverse
     for column in columns:
         b, whole = WJ.T @ column, float(column @ (w * column))
         own = whole - float(b @ inverse @ b)
@@ -1979,10 +1978,8 @@ class Moved:
 
 def moved_camera(solution: Solution) -> Moved | None:
     """The clearest shift of a log's pictures from some time on, alike in pixels: of a camera that moved."""
-    problem, r, J = solution.problem, solution.residual, solution.J
-    w = weights(problem, r)
-    WJ = J * w[:, None]
-    inverse, found = scaled_inverse(WJ.T @ J), list[Moved]()
+    problem, r, w = solution.problem, solution.residual, solution.weights
+    WJ, inverse, found = solution.weighted, solution.inverse, list[Moved]()
     pull = inverse @ (WJ.T @ r)
     for track, span in zip(problem.tracks, problem.spans, strict=True):
         # Sums from each row on, over both whitened readings: of pictures they are u and v.
@@ -2056,15 +2053,9 @@ def crossed(solution: Solution) -> dict[str, float]:
     return found
 
 
-def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
-    """The log whose rows come most clearly at another time than those of the others, and a pump that does."""
+def _apart(solution: Solution, known: Uncertainty) -> Iterator[Finding]:
+    """What logs contradict: what is known, where the camera is, when rows come, which pump pushes where."""
     raised = known.scale * max(known.inflation.values(), default=1.0)
-    far = [
-        (abs(late) / sigma, name, late)
-        for name, late, sigma in own_delays(solution)
-        if abs(late) > max(_MOST_APART_S, _APART_SIGMA * raised * sigma)
-    ]
-    out = []
     stated = values_of(solution.problem.nominal)
     for name, (value, sigma) in by_logs(solution).items():
         off = abs(value - stated[name])
@@ -2078,7 +2069,7 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
                 f"{label} is {stated[name]:.4g} {spec.unit}".rstrip() + f" in known, and {about} by the logs"
             )
             advice = "measure it and the mass again, or state its standard deviation under known"
-            out.append(Finding("inconsistent", text, advice))
+            yield Finding("inconsistent", text, advice)
     # Logs move what is known beforehand by its deviation or two; a fit that ended beside the rig, or a wrong
     # number, by ten.
     unknowns = solution.problem.unknowns
@@ -2093,7 +2084,7 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
                 "a fit that ended beside the rig"
             )
             advice = "measure it and the mass again; where they are right, identify with some logs left out"
-            out.append(Finding("inconsistent", text, advice))
+            yield Finding("inconsistent", text, advice)
     moved, slow = moved_camera(solution), _slowly_commanded(solution.problem)
     if (
         moved is not None
@@ -2111,12 +2102,17 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
             "camera, or the marker on the head, has moved"
         )
         advice = f"{then} calibrate the plane anew (calib extrinsics) for the pictures after that"
-        out.append(Finding("inconsistent", text, advice))
+        yield Finding("inconsistent", text, advice)
     for name, alike in crossed(solution).items():
         if alike < _CROSSED:
             text = f"{name}: the head bends away from the pump that pushes, correlation {alike:.2f}"
             advice = "look whether pwm1 and pwm2, or the hoses, are swapped, or the pictures are mirrored"
-            out.append(Finding("inconsistent", text, advice))
+            yield Finding("inconsistent", text, advice)
+    far = [
+        (abs(late) / sigma, name, late)
+        for name, late, sigma in own_delays(solution)
+        if abs(late) > max(_MOST_APART_S, _APART_SIGMA * raised * sigma)
+    ]
     if far:
         _, name, late = max(far)
         when = "later" if late > 0.0 else "earlier"
@@ -2124,7 +2120,7 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
             f"{name}: its pictures come {1e3 * abs(late):.0f} ms {when} after its commands than those of the "
             "other logs"
         )
-        out.append(Finding("inconsistent", text, "compare the clocks of camera and commands, log by log"))
+        yield Finding("inconsistent", text, "compare the clocks of camera and commands, log by log")
     late, sigma = pump_delay(solution) or (0.0, 1.0)
     if abs(late) > max(_PUMPS_APART_S, _APART_SIGMA * raised * sigma):
         one, other = ("pwm1", "pwm2") if late > 0.0 else ("pwm2", "pwm1")
@@ -2132,8 +2128,64 @@ def _apart(solution: Solution, known: Uncertainty) -> list[Finding]:
             f"{one} comes about {1e3 * abs(late):.0f} ms after {other}, as the rig answers them; the model "
             "has one dead time for both pumps, so damping and lags are not the rig's"
         )
-        out.append(Finding("inconsistent", text, "check the times of both columns, and hoses and valves"))
-    return out
+        yield Finding("inconsistent", text, "check the times of both columns, and hoses and valves")
+
+
+def _told(solution: Solution, known: Uncertainty) -> Iterator[Finding]:
+    """Which parameters logs do not tell, or hardly, and which a person states."""
+    for name, why in solution.fixed.items():
+        if "enter only" in why:
+            yield Finding("remark", why)
+        elif NO_CREEP in why:
+            yield Finding("remark", f"{label_of(name)}: {why}")
+        else:
+            text = f"{label_of(name)} is not identifiable from these logs: {why}"
+            yield Finding("unidentifiable", text)
+    most = max((float(track.pwm.max()) for track in solution.problem.tracks if track.hoses), default=0.0)
+    if 0.0 < most <= 100.0 and {*STRENGTHS} <= solution.fixed.keys():
+        unit = "unit: percent" if most > 1.0 else "factor: 255"
+        text = f"no command exceeds {most:.3g} of 255, below which the pumps give no force"
+        said = f"of other units, say pwm1: {{column: pwm1, {unit}}} in columns.yaml, and pwm2 so"
+        yield Finding("unidentifiable", text, said)
+    fixed = [label_of(name) for name, sigma in solution.problem.stated.items() if not sigma]
+    if fixed:
+        yield Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}")
+    priors = [label_of(name) for name in solution.problem.names if solution.problem.stated.get(name)]
+    if priors:
+        yield Finding("remark", f"known with a standard deviation, which went in: {', '.join(priors)}")
+    for name, value in solution.values.items():
+        relative = known.sigma[name] / max(abs(value), 1e-12)
+        if relative > _MOST_RELATIVE:
+            so = f"known to {100.0 * relative:.0f} % only"
+            if relative > 1.0:
+                so = f"{value:.3g} +- {known.sigma[name]:.2g}: these logs do not tell it from zero"
+            if known.scatter[name] > _MOST_SCATTER:
+                times = f"{known.scatter[name]:.1f} times"
+                so += f"; stretches of the logs disagree on it, which raised its deviation {times}"
+            yield Finding("poor", f"{label_of(name)} is {so}")
+
+
+def _of_logs(solution: Solution, held: Sequence[HeldLog], next_ones: Sequence[Prospect]) -> Iterator[Finding]:
+    """How logs are met that were held back, the law of the pumps, and what to record next."""
+    for log in held:
+        # A log that alone tells a parameter is predicted badly by the others, who say nothing against it.
+        if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4 and log.chance < _LEAST_CHANCE:
+            text = (
+                f"{log.name}: held back, its angle is predicted to {1e3 * log.held_phi_rad:.3g} mrad, "
+                f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad, by parameters that the other logs contradict"
+            )
+            yield Finding("poor", text)
+    if solution.law:
+        yield Finding("remark", solution.law)
+    if not held and len(solution.problem.tracks) == 1:
+        yield Finding("remark", "one log alone: nothing is left to check the parameters on")
+    if next_ones:
+        best = next_ones[0]
+        advice = (
+            f"calib record PORT -o {best.name}.csv --do {best.name} ({best.what}) would leave "
+            f"{label_of(best.worst)} as the least known, to {100.0 * best.worst_relative:.2g} %"
+        )
+        yield Finding("remark", "", advice)
 
 
 def judge(
@@ -2144,55 +2196,6 @@ def judge(
     next_ones: Sequence[Prospect],
 ) -> Verdict:
     """Judge an identification from what was computed of it."""
-    out = []
-    for name, why in solution.fixed.items():
-        if "enter only" in why:
-            out.append(Finding("remark", why))
-        elif NO_CREEP in why:
-            out.append(Finding("remark", f"{label_of(name)}: {why}"))
-        else:
-            text = f"{label_of(name)} is not identifiable from these logs: {why}"
-            out.append(Finding("unidentifiable", text))
-    most = max((float(track.pwm.max()) for track in solution.problem.tracks if track.hoses), default=0.0)
-    if 0.0 < most <= 100.0 and {"strength1", "strength2"} <= solution.fixed.keys():
-        unit = "unit: percent" if most > 1.0 else "factor: 255"
-        text = f"no command exceeds {most:.3g} of 255, below which the pumps give no force"
-        said = f"of other units, say pwm1: {{column: pwm1, {unit}}} in columns.yaml, and pwm2 so"
-        out.append(Finding("unidentifiable", text, said))
-    fixed = [label_of(name) for name, sigma in solution.problem.stated.items() if not sigma]
-    if fixed:
-        out.append(Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}"))
-    priors = [label_of(name) for name in solution.problem.names if solution.problem.stated.get(name)]
-    if priors:
-        out.append(Finding("remark", f"known with a standard deviation, which went in: {', '.join(priors)}"))
-    for name, value in solution.values.items():
-        relative = known.sigma[name] / max(abs(value), 1e-12)
-        if relative > _MOST_RELATIVE:
-            so = f"known to {100.0 * relative:.0f} % only"
-            if relative > 1.0:
-                so = f"{value:.3g} +- {known.sigma[name]:.2g}: these logs do not tell it from zero"
-            if known.scatter[name] > _MOST_SCATTER:
-                times = f"{known.scatter[name]:.1f} times"
-                so += f"; stretches of the logs disagree on it, which raised its deviation {times}"
-            out.append(Finding("poor", f"{label_of(name)} is {so}"))
-    out += [*_of_fit(solution, known, colours), *_apart(solution, known)]
-    for log in held:
-        # A log that alone tells a parameter is predicted badly by the others, who say nothing against it.
-        if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4 and log.chance < _LEAST_CHANCE:
-            text = (
-                f"{log.name}: held back, its angle is predicted to {1e3 * log.held_phi_rad:.3g} mrad, "
-                f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad, by parameters that the other logs contradict"
-            )
-            out.append(Finding("poor", text))
-    if solution.law:
-        out.append(Finding("remark", solution.law))
-    if not held and len(solution.problem.tracks) == 1:
-        out.append(Finding("remark", "one log alone: nothing is left to check the parameters on"))
-    if next_ones:
-        best = next_ones[0]
-        advice = (
-            f"calib record PORT -o {best.name}.csv --do {best.name} ({best.what}) would leave "
-            f"{label_of(best.worst)} as the least known, to {100.0 * best.worst_relative:.2g} %"
-        )
-        out.append(Finding("remark", "", advice))
-    return Verdict.of(out)
+    told, apart = _told(solution, known), _apart(solution, known)
+    fit, logs = _of_fit(solution, known, colours), _of_logs(solution, held, next_ones)
+    return Verdict.of([*told, *fit, *apart, *logs])

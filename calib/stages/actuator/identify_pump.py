@@ -548,7 +548,7 @@ def fit_pump(
     off = problem.off()
     fixed: dict[str, str] = {}
     if start is not None:
-        free = [k for k in range(len(names)) if start[k] != off[k] and not _tied(model, names[k], start)]
+        free = np.flatnonzero(start != off).tolist()
         theta, cost = _solve(problem, start, free)
     else:
         theta, cost, free = _search(problem, nominal, off, fixed)
@@ -567,11 +567,6 @@ def fit_pump(
         problem.shape,
         fixed,
     )
-
-
-def _tied(model: str, name: str, theta: FloatArray) -> bool:
-    """Whether a parameter does nothing because another is switched off."""
-    return model == ORIFICE and name == "chamber_s" and float(theta[5]) == 0.0
 
 
 def _search(
@@ -1245,6 +1240,17 @@ def _model(found: PumpFound, name: str) -> PumpModel:
     )
 
 
+def of_lag(model: PumpModel, tick_s: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Lag and dead time of the linear model by their keys of the section, and their standard deviations."""
+    value, sigma = model.parameters, model.sigma
+    late_s = sigma["dead_time_s"]
+    late = None if late_s is None else late_s / tick_s
+    return (
+        {"lag_s": value["lag_s"], "delay_ticks": round(value["dead_time_s"] / tick_s)},
+        {"lag_s": sigma["lag_s"], "delay_ticks": late},
+    )
+
+
 def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
     """The section, with lag and dead time of the linear model where a recording tells them.
 
@@ -1254,17 +1260,14 @@ def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
     stated = rig.known.pump if rig.known is not None and rig.known.pump is not None else KnownPump()
     update = judged(judge_pump(found))
     sigma: dict[str, Any] = before.get("sigma", {})
-    if found.fits:
-        lag = found.fits[LAG]
-        tick_s = stated.tick_s or before.get("tick_s", TICK_S)
-        update |= {
-            "lag_s": lag.values["lag_s"],
-            "delay_ticks": round(lag.values["dead_time_s"] / tick_s),
-        }
-        sigma |= {"lag_s": lag.sigma["lag_s"], "delay_ticks": lag.sigma["dead_time_s"] / tick_s}
-        dead = lag.shape.dead_pwm
+    models = {name: _model(found, name) for name in found.fits}
+    if models:
+        values, deviations = of_lag(models[LAG], stated.tick_s or before.get("tick_s", TICK_S))
+        update, sigma = update | values, sigma | deviations
+        shape = found.fits[LAG].shape
+        dead = shape.dead_pwm
         if dead > 0.0:
-            of = [m for m in found.maps if m.shape == lag.shape]
+            of = [m for m in found.maps if m.shape == shape]
             supply = stated.supply_V or before.get("supply_V", SUPPLY_V)
             update["dead_zone_V"] = supply * dead / PWM_MAX
             wide = of[0].fit.sigma["dead_pwm"] if of else None
@@ -1272,7 +1275,7 @@ def pump_section(found: PumpFound, rig: Rig) -> PumpSection:
     identified = PumpIdentified.model_validate(
         {
             "unit": found.unit,
-            "models": {name: _model(found, name) for name in found.fits},
+            "models": models,
             "better": found.better,
             "static": {m.name: m.fit for m in found.maps},
             "groups": found.groups,

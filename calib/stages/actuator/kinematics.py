@@ -8,6 +8,7 @@ from math import factorial
 from typing import ParamSpec, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 from numba.extending import register_jitable
 
 from calib.core.arrays import FloatArray
@@ -148,6 +149,17 @@ def length(q_m: FloatArray) -> FloatArray:
     return 0.5 * (q1 + q2)
 
 
+def angle_and_length(q_m: FloatArray, bellows_radius_m: float) -> FloatArray:
+    """Angle and length (..., 2) [rad, m] of the bellows' lengths (..., 2) (3.3); of rates their rates."""
+    return np.stack([angle(q_m, bellows_radius_m), length(q_m)], axis=-1)
+
+
+def bellows(phi_rad: npt.ArrayLike, length_m: npt.ArrayLike, bellows_radius_m: float) -> FloatArray:
+    """Lengths of the bellows (..., 2) [m] of an angle and a length (3.3); of rates their rates."""
+    middle, turned = np.asarray(length_m), bellows_radius_m * np.asarray(phi_rad)
+    return np.stack([middle + turned, middle - turned], axis=-1)
+
+
 def configuration_from_pose(pose: FloatArray) -> FloatArray:
     """Curvature and length (..., 2) [1/m, m] of the head (..., 3) (3.11).
 
@@ -175,9 +187,7 @@ def inverse(pose: FloatArray, bellows_radius_m: float) -> FloatArray:
     Only the distance of (x, y) from the base counts, as in the source. Raises `BadInputError` for
     |phi| >= 2 pi.
     """
-    ell = configuration_from_pose(pose)[..., 1]
-    half = bellows_radius_m * np.asarray(pose, dtype=np.float64)[..., 2]
-    return np.stack([ell + half, ell - half], axis=-1)
+    return bellows(np.asarray(pose)[..., 2], configuration_from_pose(pose)[..., 1], bellows_radius_m)
 
 
 def _arc_derivatives(phi: FloatArray) -> tuple[FloatArray, ...]:

@@ -21,6 +21,7 @@ from calib.io.tables import read_cells
 from calib.solve.clock import clock_step_s
 from calib.stages.actuator.identify import Start, Track, without_outliers
 from calib.stages.actuator.identify_pump import PumpRecord, PumpTable, Settled
+from calib.stages.actuator.kinematics import angle_and_length, bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import TICK_S, Plant
 from calib.stages.control.laws import holding_force
@@ -246,8 +247,7 @@ def swing_at_beginning(t_s: FloatArray, phi_rad: FloatArray) -> tuple[float, flo
 
 def held_by_pumps(start: Start, plant: Plant) -> Start:
     """The start with pumps that just hold the head."""
-    turned = plant.bellows_radius_m * start.phi_rad
-    q = np.array([start.length_m + turned, start.length_m - turned])
+    q = bellows(start.phi_rad, start.length_m, plant.bellows_radius_m)
     F1, F2 = np.maximum(holding_force(plant, q), 0.0).tolist()
     return replace(start, force1_N=F1, force2_N=F2, lag1_N=F1, lag2_N=F2)
 
@@ -375,10 +375,9 @@ def _from_truth(log: Log, bellows_radius_m: float) -> Head:
     rows = log.sampled("true_q1_m", "true_q2_m")
     if not len(rows):
         raise BadInputError(f"{log.source}: has no true_q1_m and true_q2_m, which --truth needs")
-    q1, q2 = log.columns["true_q1_m"][rows], log.columns["true_q2_m"][rows]
-    head = np.stack([(q1 - q2) / (2.0 * bellows_radius_m), 0.5 * (q1 + q2)], axis=1)
+    q = np.stack([log.columns["true_q1_m"][rows], log.columns["true_q2_m"][rows]], axis=1)
     W = np.broadcast_to(np.diag(1.0 / np.array(_TRUE_SIGMA)), (len(rows), 2, 2)).copy()
-    return log.t_s[rows], head, W
+    return log.t_s[rows], angle_and_length(q, bellows_radius_m), W
 
 
 def _check_clock(log: Log) -> None:

@@ -38,7 +38,7 @@ from calib.stages.actuator.identify import (
     uncertainty,
     values_of,
 )
-from calib.stages.actuator.identify_pump import LAG
+from calib.stages.actuator.identify_pump import LAG, of_lag
 from calib.stages.actuator.machine import Machine, machine_from
 from calib.stages.actuator.parameters import Stiffness
 from calib.stages.actuator.section import CREEP, KNOTS, LAW, STRENGTHS, Actuator, Known, PumpSection, in_force
@@ -88,13 +88,8 @@ def _by_tables(rig: Rig) -> tuple[dict[str, Any], dict[str, Any]]:
     before = rig.pump
     values, sigma = _kept(before, _OF_TABLES)
     model = None if before is None or before.identified is None else before.identified.models.get(LAG)
-    if model is not None:
-        tick_s = rig.machine.pump.tick_s
-        values |= {"lag_s": model.parameters["lag_s"]}
-        values |= {"delay_ticks": round(model.parameters["dead_time_s"] / tick_s)}
-        late = model.sigma.get("dead_time_s")
-        sigma |= {"lag_s": model.sigma.get("lag_s"), "delay_ticks": None if late is None else late / tick_s}
-    return values, sigma
+    told, deviations = ({}, {}) if model is None else of_lag(model, rig.machine.pump.tick_s)
+    return values | told, sigma | deviations
 
 
 _OF_TABLES = ("tick_s", "supply_V", "dead_zone_V")

@@ -37,6 +37,22 @@ STRENGTHS = ("strength1", "strength2")
 """Parameters of an identification that `strength` holds."""
 
 
+def _of_values(kind: type[Section], sigma: Deviations, info: ValidationInfo) -> Deviations:
+    """Deviations whose keys are those of a section; a statement has a value beside each."""
+    values, needed = info.data, issubclass(kind, Statement)
+    keys = (*kind.model_fields, *(KNOTS if "elongation_mm" in kind.model_fields else ()))
+    for name, one in sigma.items():
+        if name not in keys:
+            raise ValueError(f"expected keys of the section, {one_line(name)} is none{nearest(name, keys)}")
+        value = values.get("elongation_mm" if name in KNOTS else name)
+        size = len(value) if isinstance(value, list) and name not in KNOTS else 0
+        if needed and value is None:
+            raise ValueError(f"expected a value beside the standard deviation of {name}")
+        if value is not None and size != (len(one) if isinstance(one, list) else 0):
+            raise ValueError(f"expected {f'{size} numbers' if size else 'a number'} for {name}")
+    return sigma
+
+
 class ActuatorParameters(Section):
     """Mechanical parameters, see `calib.stages.actuator.parameters`; absent ones are nominal.
 
@@ -70,6 +86,8 @@ class ActuatorParameters(Section):
     lambda3: Number | None = quantity(None, label="creep lambda3", ge=-1e3, le=1e3)
     gravity_mps2: Annotated[list[Acceleration], Field(min_length=2, max_length=2)] | None = None
 
+    _checked = field_validator("sigma", check_fields=False)(classmethod(_of_values))
+
 
 class PumpParameters(Section):
     """Both pumps, see `calib.stages.actuator.pump`; absent values are nominal.
@@ -99,21 +117,7 @@ class PumpParameters(Section):
         None, label="strength of the pumps"
     )
 
-
-def _of_values(kind: type[Section], sigma: Deviations, info: ValidationInfo) -> Deviations:
-    """Deviations whose keys are those of a section; a statement has a value beside each."""
-    values, needed = info.data, issubclass(kind, Statement)
-    keys = (*kind.model_fields, *(KNOTS if issubclass(kind, PumpParameters) else ()))
-    for name, one in sigma.items():
-        if name not in keys:
-            raise ValueError(f"expected keys of the section, {one_line(name)} is none{nearest(name, keys)}")
-        value = values.get("elongation_mm" if name in KNOTS else name)
-        size = len(value) if isinstance(value, list) and name not in KNOTS else 0
-        if needed and value is None:
-            raise ValueError(f"expected a value beside the standard deviation of {name}")
-        if value is not None and size != (len(one) if isinstance(one, list) else 0):
-            raise ValueError(f"expected {f'{size} numbers' if size else 'a number'} for {name}")
-    return sigma
+    _checked = field_validator("sigma", check_fields=False)(classmethod(_of_values))
 
 
 class KnownActuator(ActuatorParameters, Statement):
@@ -121,15 +125,11 @@ class KnownActuator(ActuatorParameters, Statement):
 
     sigma: Deviations = {}
 
-    _checked = field_validator("sigma")(classmethod(_of_values))
-
 
 class KnownPump(PumpParameters, Statement):
     """What a person states of the pumps: fixed, or with its standard deviation a prior."""
 
     sigma: Deviations = {}
-
-    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 class Known(Statement):
@@ -149,8 +149,6 @@ class Actuator(ActuatorParameters, Result):
 
     sigma: Deviations = {}
     covariance: CovarianceTable | None = None
-
-    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 class PumpModel(Section):
@@ -215,8 +213,6 @@ class PumpSection(PumpParameters, Result):
     sigma: Deviations = {}
     covariance: CovarianceTable | None = None
     identified: PumpIdentified | None = None
-
-    _checked = field_validator("sigma")(classmethod(_of_values))
 
 
 # ----------------------------------------------------------------------

@@ -14,7 +14,7 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.compilation import kernel
 from calib.core.errors import BadInputError
 from calib.stages.actuator.dynamics import Coefficients, coefficients, linearised, rates
-from calib.stages.actuator.kinematics import LARGEST_ANGLE_RAD, inlined
+from calib.stages.actuator.kinematics import LARGEST_ANGLE_RAD, bellows, inlined
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import (
     Pump,
@@ -278,8 +278,8 @@ def state_row(
     Raises `BadInputError` where a bellows would have no length.
     """
     l = plant.rest_length_m if length_m is None else length_m  # noqa: E741  the source's symbol
-    turned = plant.bellows_radius_m * phi_rad
-    row = np.array([l + turned, l - turned, 0.0, 0.0, 0.0, 0.0, *force_N, *force_N])
+    q1, q2 = bellows(phi_rad, l, plant.bellows_radius_m)
+    row = np.array([q1, q2, 0.0, 0.0, 0.0, 0.0, *force_N, *force_N])
     check_start(row)
     return row
 

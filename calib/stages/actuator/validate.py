@@ -30,6 +30,7 @@ from calib.core.arrays import FloatArray
 from calib.core.options import LogOptions, PoseOptions
 from calib.core.rig import Rig
 from calib.stages.actuator.identify import Start, Track, heads_of, made, without_outliers
+from calib.stages.actuator.kinematics import angle_and_length, bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.read import held_by_pumps, read_track
@@ -102,8 +103,7 @@ def errors_of(measured: FloatArray, simulated: FloatArray) -> dict[str, Error]:
 
 def _columns(head: FloatArray, bellows_radius_m: float) -> FloatArray:
     """q1, q2 and phi (n, 3) of angle and length (n, 2)."""
-    turned = bellows_radius_m * head[:, 0]
-    return np.column_stack([head[:, 1] + turned, head[:, 1] - turned, head[:, 0]])
+    return np.column_stack([bellows(head[:, 0], head[:, 1], bellows_radius_m), head[:, 0]])
 
 
 def _cleaned(track: Track) -> tuple[Track, int]:
@@ -133,11 +133,9 @@ def estimated_start(
     if not known.any():
         return None
     k = int(np.argmin(np.where(known, np.abs(t - begin_s), np.inf)))
-    half = 0.5 / log.setup.bellows_radius_m
     # From the row's own time to the beginning.
-    q1, q2 = (q[k] + (begin_s - t[k]) * dq[k]).tolist()
-    dq1, dq2 = dq[k].tolist()
-    return Start(half * (q1 - q2), 0.5 * (q1 + q2), half * (dq1 - dq2), 0.5 * (dq1 + dq2))
+    states = np.array([q[k] + (begin_s - t[k]) * dq[k], dq[k]])
+    return Start(*angle_and_length(states, log.setup.bellows_radius_m).ravel().tolist())
 
 
 def _begun(track: Track, start: Start, nominal: Machine) -> Track:

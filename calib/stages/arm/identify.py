@@ -366,6 +366,11 @@ def held_fits(
     }
 
 
+def _held_errors(trials: Sequence[Trial], held: Mapping[str, Fit]) -> dict[str, Errors]:
+    """Errors on each trial of the fit to the others, by name."""
+    return {one.name: errors_of(held[one.name], one) for one in trials}
+
+
 def _deviations(made: Fit, held: Mapping[str, Fit]) -> dict[str, float]:
     """Standard deviations of the parameters: the posterior's or the jackknife's, the larger."""
     n, out = len(held), {}
@@ -407,7 +412,7 @@ def _error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
 
     A trial that alone holds its load or day is far off whatever the parts, and outweighs no other.
     """
-    errors = [errors_of(held[one.name], one) for one in trials]
+    errors = _held_errors(trials, held).values()
     for name in ("angle_by_pressure_rad", "angle_rad"):
         values = [one[name] for one in errors if math.isfinite(one[name])]
         if values:
@@ -536,12 +541,12 @@ def identify(
     drive, other_drive = ("lag", "pump") if any(one.pwm for one in trials) else ("valve", "lag")
     assembly = assembly.driven_by(drive)
     scale, held = _held(trials, assembly, scale) if len(trials) > 1 else (scale, {})
-    errors = {one.name: errors_of(held[one.name], one) for one in trials if one.name in held}
+    errors = _held_errors(trials, held) if held else {}
     others: dict[str, Mapping[str, Errors]] = {}
     if held and any(len(one.command) for one in trials):
         driven = assembly.driven_by(other_drive)
         fits = held_fits(trials, driven, scale, held)
-        by_other = {one.name: errors_of(fits[one.name], one) for one in trials}
+        by_other = _held_errors(trials, fits)
         if mean_of(by_other, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
             others[f"a {drive} for the {other_drive}"] = errors
             assembly, held, errors = driven, fits, by_other
@@ -553,7 +558,7 @@ def identify(
             others[f"without {name}"] = errors
             assembly = more
             scale, held = _held(trials, assembly, replace(scale, finer=1.0))
-            errors = {one.name: errors_of(held[one.name], one) for one in trials}
+            errors = _held_errors(trials, held)
     variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}
     chosen = variants if compare and len(trials) > 1 else {}
     steps = 2 + len(chosen)
@@ -561,8 +566,7 @@ def identify(
     made = fit(trials, assembly, scale)
     progress(2, steps)
     for k, (name, other) in enumerate(chosen.items()):
-        fits = held_fits(trials, other, scale, held)
-        others[name] = {one.name: errors_of(fits[one.name], one) for one in trials}
+        others[name] = _held_errors(trials, held_fits(trials, other, scale, held))
         progress(3 + k, steps)
     if len(trials) > 1:
         others |= baselines(trials)

@@ -49,7 +49,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -92,18 +92,18 @@ class Parameter:
     Attributes
     ----------
     centre, spread : prior; of the logarithm where `positive`, in units of `powers` otherwise.
-    either_way : a size from which on the prior is that of a logarithm, whatever the sign.
-    powers : of pressure, angle, chord and command of the scale that make its unit.
     identified_by : what a log must hold to tell it.
+    powers : of pressure, angle, chord and command of the scale that make its unit.
+    either_way : a size from which on the prior is that of a logarithm, whatever the sign.
     """
 
     name: str
     unit: str
     centre: float
     spread: float
+    identified_by: str
     positive: bool = False
     powers: tuple[int, int, int, int] = (0, 0, 0, 0)
-    identified_by: str = ""
     either_way: float = 0.0
 
     def value(self, z: float, scale: Scale) -> float:
@@ -138,7 +138,7 @@ class Part:
 
     name: str
     parameters: tuple[Parameter, ...]
-    off: Mapping[str, float]
+    off: Mapping[str, float] = field(default_factory=dict)
     drives: bool = False
 
 
@@ -149,134 +149,110 @@ PARTS = (
     Part(
         "valve",
         (
-            Parameter("pilot_per_s", "1/s", 1.0, 0.5, True, identified_by=_STEPS),
-            Parameter("pilot_drains", "", 1.0, 0.3, True, identified_by=_STEPS),
-            Parameter(
-                "pilot_jump_kpa", "kPa", 0.07, 0.5, True, _P, identified_by="small steps of the command"
-            ),
-            Parameter("overlap_kpa", "kPa", 0.1, 0.6, True, _P, identified_by="commands that change sign"),
-            Parameter("opening_kpa", "kPa", 0.03, 0.7, True, _P, identified_by="commands that change sign"),
-            Parameter("supply_per_s", "1/s", 1.2, 0.4, True, identified_by="steps up"),
-            Parameter("exhaust_per_s", "1/s", 1.5, 0.4, True, identified_by="steps down"),
-            Parameter("supply_kpa", "kPa", 1.0, 0.12, True, _P, identified_by="long steps up"),
-            Parameter("line_per_s", "1/s", 4.0, 0.6, True, identified_by=_STEPS),
-            Parameter("line_to_chamber", "", 0.7, 0.6, True, identified_by=_STEPS),
-            Parameter("leak_per_s", "1/s", 0.3, 0.5, True, identified_by="holds"),
-            Parameter("input_s", "s", 0.03, 0.7, True, identified_by="commands that switch fast"),
+            Parameter("pilot_per_s", "1/s", 1.0, 0.5, _STEPS, True),
+            Parameter("pilot_drains", "", 1.0, 0.3, _STEPS, True),
+            Parameter("pilot_jump_kpa", "kPa", 0.07, 0.5, "small steps of the command", True, powers=_P),
+            Parameter("overlap_kpa", "kPa", 0.1, 0.6, "commands that change sign", True, powers=_P),
+            Parameter("opening_kpa", "kPa", 0.03, 0.7, "commands that change sign", True, powers=_P),
+            Parameter("supply_per_s", "1/s", 1.2, 0.4, "steps up", True),
+            Parameter("exhaust_per_s", "1/s", 1.5, 0.4, "steps down", True),
+            Parameter("supply_kpa", "kPa", 1.0, 0.12, "long steps up", True, powers=_P),
+            Parameter("line_per_s", "1/s", 4.0, 0.6, _STEPS, True),
+            Parameter("line_to_chamber", "", 0.7, 0.6, _STEPS, True),
+            Parameter("leak_per_s", "1/s", 0.3, 0.5, "holds", True),
+            Parameter("input_s", "s", 0.03, 0.7, "commands that switch fast", True),
         ),
-        {},
         drives=True,
     ),
     Part(
         "lag",
         (
-            Parameter("kpa_per_command", "kPa", 1.0, 0.3, True, (1, 0, 0, -1), identified_by="long steps"),
-            Parameter("rises_s", "s", 1.0, 0.7, True, identified_by="steps up"),
-            Parameter("falls_s", "s", 1.0, 0.7, True, identified_by="steps down"),
+            Parameter("kpa_per_command", "kPa", 1.0, 0.3, "long steps", True, powers=(1, 0, 0, -1)),
+            Parameter("rises_s", "s", 1.0, 0.7, "steps up", True),
+            Parameter("falls_s", "s", 1.0, 0.7, "steps down", True),
         ),
-        {},
         drives=True,
     ),
     Part(
         "pump",
         (
-            Parameter("delivers_per_s", "kPa/s", 1.5, 0.8, True, (1, 0, 0, -1), identified_by="steps up"),
-            Parameter("dead_command", "", 0.1, 0.1, powers=(0, 0, 0, 1), identified_by="small commands"),
-            Parameter("stalls_kpa", "kPa", 2.0, 0.5, True, _P, identified_by="long steps"),
-            Parameter("orifice_per_s", "1/s", 0.3, 0.8, True, identified_by="steps down"),
-            Parameter("seeps_per_s", "1/s", 0.3, 0.8, True, identified_by="steps down to zero"),
+            Parameter("delivers_per_s", "kPa/s", 1.5, 0.8, "steps up", True, powers=(1, 0, 0, -1)),
+            Parameter("dead_command", "", 0.1, 0.1, "small commands", powers=(0, 0, 0, 1)),
+            Parameter("stalls_kpa", "kPa", 2.0, 0.5, "long steps", True, powers=_P),
+            Parameter("orifice_per_s", "1/s", 0.3, 0.8, "steps down", True),
+            Parameter("seeps_per_s", "1/s", 0.3, 0.8, "steps down to zero", True),
         ),
-        {},
         drives=True,
     ),
     Part(
         "segment",
         (
-            Parameter("rest_rad", "rad", -0.1, 0.05, powers=_A, identified_by="rest"),
-            Parameter("bends_rad_per_kpa", "rad/kPa", 1.8, 0.6, powers=(-1, 1, 0, 0), identified_by=_SLOW),
-            Parameter("fill_s", "s", 0.3, 0.6, True, identified_by=_STEPS),
-            Parameter("lag_s", "s", 1.8, 0.4, True, identified_by=_STEPS),
+            Parameter("rest_rad", "rad", -0.1, 0.05, "rest", powers=_A),
+            Parameter("bends_rad_per_kpa", "rad/kPa", 1.8, 0.6, _SLOW, powers=(-1, 1, 0, 0)),
+            Parameter("fill_s", "s", 0.3, 0.6, _STEPS, True),
+            Parameter("lag_s", "s", 1.8, 0.4, _STEPS, True),
         ),
-        {},
     ),
     Part(
         "inertia",
         (
-            Parameter("swings_s", "s", 0.15, 0.6, True, identified_by=_STEPS),
-            Parameter("damps", "", 0.1, 1.0, True, identified_by=_STEPS),
+            Parameter("swings_s", "s", 0.15, 0.6, _STEPS, True),
+            Parameter("damps", "", 0.1, 1.0, _STEPS, True),
         ),
         {"swings_s": 0.0, "damps": 1.0},
     ),
     Part(
         "toe",
-        (Parameter("toe_kpa", "kPa", 0.2, 1.0, True, _P, identified_by=_SLOW),),
+        (Parameter("toe_kpa", "kPa", 0.2, 1.0, _SLOW, True, powers=_P),),
         {"toe_kpa": 0.0},
     ),
     Part(
         "stiffening",
-        (Parameter("stiffens_per_kpa", "1/kPa", 0.8, 0.6, True, (-1, 0, 0, 0), identified_by=_SLOW),),
+        (Parameter("stiffens_per_kpa", "1/kPa", 0.8, 0.6, _SLOW, True, powers=(-1, 0, 0, 0)),),
         {"stiffens_per_kpa": 0.0},
     ),
     Part(
         "hysteresis",
         (
-            Parameter("hysteresis_rad", "rad", 0.05, 0.04, powers=_A, identified_by="reversals"),
-            Parameter(
-                "hysteresis_range_rad", "rad", 0.14, 0.25, True, _A, identified_by="reversals of many sizes"
-            ),
+            Parameter("hysteresis_rad", "rad", 0.05, 0.04, "reversals", powers=_A),
+            Parameter("hysteresis_range_rad", "rad", 0.14, 0.25, "reversals of many sizes", True, powers=_A),
         ),
         {"hysteresis_rad": 0.0, "hysteresis_range_rad": 1.0},
     ),
     Part(
         "creep",
         (
-            Parameter("creep", "", 0.05, 0.1, identified_by="holds of a minute"),
-            Parameter("creep_s", "s", 20.0, 0.5, True, identified_by="holds of a minute"),
+            Parameter("creep", "", 0.05, 0.1, "holds of a minute"),
+            Parameter("creep_s", "s", 20.0, 0.5, "holds of a minute", True),
         ),
         {"creep": 0.0, "creep_s": 1.0},
     ),
     Part(
         "settling",
         (
-            Parameter(
-                "settling_rad_per_m", "rad/m", 7.0, 5.0, powers=(0, 1, -1, 0), identified_by="vented starts"
-            ),
-            Parameter("settling_s", "s", 4.0, 0.5, True, identified_by="vented starts"),
-            Parameter(
-                "settling_per_kpa", "1/kPa", 1.2, 0.8, powers=(-1, 0, 0, 0), identified_by="vented starts"
-            ),
+            Parameter("settling_rad_per_m", "rad/m", 7.0, 5.0, "vented starts", powers=(0, 1, -1, 0)),
+            Parameter("settling_s", "s", 4.0, 0.5, "vented starts", True),
+            Parameter("settling_per_kpa", "1/kPa", 1.2, 0.8, "vented starts", powers=(-1, 0, 0, 0)),
         ),
         {"settling_rad_per_m": 0.0, "settling_s": 1.0, "settling_per_kpa": 0.0},
     ),
     Part(
         "load",
         (
-            Parameter(
-                "compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.7, identified_by="a known load", either_way=0.1
-            ),
-            Parameter(
-                "compliance_across_rad_per_Nm",
-                "rad/(N m)",
-                0.0,
-                0.7,
-                identified_by="a known load",
-                either_way=0.1,
-            ),
+            Parameter("compliance_rad_per_Nm", "rad/(N m)", 0.2, 0.7, "a known load", either_way=0.1),
+            Parameter("compliance_across_rad_per_Nm", "rad/(N m)", 0.0, 0.7, "a known load", either_way=0.1),
         ),
         {"compliance_rad_per_Nm": 0.0, "compliance_across_rad_per_Nm": 0.0},
     ),
     Part(
         "chord",
         (
-            Parameter("chord_m", "m", 1.0, 0.02, powers=(0, 0, 1, 0), identified_by="the tip's position"),
-            Parameter("chord_m_per_rad", "m/rad", -0.05, 0.05, powers=(0, -1, 1, 0), identified_by=_SLOW),
-            Parameter("chord_m_per_rad2", "m/rad²", -0.07, 0.05, powers=(0, -2, 1, 0), identified_by=_SLOW),
-            Parameter("lengthens_s", "s", 4.0, 0.5, True, identified_by="vented starts"),
-            Parameter(
-                "lengthens_per_kpa", "1/kPa", 1.2, 0.8, powers=(-1, 0, 0, 0), identified_by="vented starts"
-            ),
+            Parameter("chord_m", "m", 1.0, 0.02, "the tip's position", powers=(0, 0, 1, 0)),
+            Parameter("chord_m_per_rad", "m/rad", -0.05, 0.05, _SLOW, powers=(0, -1, 1, 0)),
+            Parameter("chord_m_per_rad2", "m/rad²", -0.07, 0.05, _SLOW, powers=(0, -2, 1, 0)),
+            Parameter("lengthens_s", "s", 4.0, 0.5, "vented starts", True),
+            Parameter("lengthens_per_kpa", "1/kPa", 1.2, 0.8, "vented starts", powers=(-1, 0, 0, 0)),
         ),
-        {},
     ),
 )
 """In the order of the parameters."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray
+from calib.core.arrays import BoolArray, FloatArray, IntArray, runs
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.io.columns import COMMANDED, POSITION, PRESSURES, PWM, QUATERNION
@@ -233,8 +233,7 @@ def _stuck(recording: Recording) -> Iterator[Finding]:
         least_s = _FROZEN_S[name]
         others = [other for other in there if other != name and (other != "pose" or name == "command")]
         steps = np.abs(np.diff(values.reshape(len(values), -1), axis=0)).max(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], steps <= _STILL, [False]]).astype(np.int8)))
-        for first, last in edges.reshape(-1, 2).tolist():
+        for first, last in runs(steps <= _STILL):
             if t[last] - t[first] < least_s:
                 continue
             # What moved before the signal stood still may still arrive.

@@ -74,6 +74,16 @@ class Pid:
     tick_s: float = TICK_S
 
 
+ANGLE_PIDS = {
+    "p": Pid(1000.0),
+    "pid": Pid(1000.0, 1000.0, 10.0),
+    "clamping": Pid(1000.0, 1000.0, 10.0, clamping=True),
+}
+"""Of the angle, by the names of the source's controllers (Figs. 4.2 and 4.4)."""
+LENGTHS_PD = Pid(15000.0, 0.0, 150.0)
+"""Of the lengths (Fig. 4.12)."""
+
+
 class Channel:
     """A controller of one bellows with its memory, zeros at the start.
 
@@ -252,19 +262,18 @@ def bent_rest(model: Model, phi_rad: float) -> FloatArray:
     from scipy.optimize import brentq
 
     plant = model.plant
-    half, idle = plant.bellows_radius_m * phi_rad, 1 if phi_rad >= 0.0 else 0
+    r, idle = plant.bellows_radius_m, 1 if phi_rad >= 0.0 else 0
 
     def rest(l: float) -> float:  # noqa: E741  the source's symbol
-        return float(holding_force(plant, np.array([l + half, l - half]))[idle])
+        return float(holding_force(plant, kinematics.bellows(phi_rad, l, r))[idle])
 
-    low, high = max(abs(half) * 1.001, 0.2 * plant.rest_length_m), 3.0 * plant.rest_length_m
+    low, high = max(abs(r * phi_rad) * 1.001, 0.2 * plant.rest_length_m), 3.0 * plant.rest_length_m
     if not (low < high and rest(low) < 0.0 < rest(high)):
         raise BadInputError(
             f"angle: found {phi_rad:g} rad, at which no length is at rest with one pump, expected a "
             "smaller one"
         )
-    l = float(brentq(rest, low, high, xtol=1e-12))  # noqa: E741  the source's symbol
-    return np.array([l + half, l - half])
+    return kinematics.bellows(phi_rad, float(brentq(rest, low, high, xtol=1e-12)), r)
 
 
 def static_stiffness(plant: Plant, q_m: FloatArray) -> FloatArray:

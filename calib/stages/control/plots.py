@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.core import plot
-from calib.stages.actuator.kinematics import angle, forward, length
+from calib.stages.actuator.kinematics import angle, bellows, forward, length
 from calib.stages.control import tuning
 from calib.stages.control.laws import Model, holding_force, largest_force_N
 from calib.stages.control.references import Reference
@@ -174,8 +174,7 @@ def _reachable(model: Model) -> plot.Mark:
     phi_most, l_most = 1.1 * tuning.largest_angle(model), tuning.longest_m(model)
     phi = np.linspace(-phi_most, phi_most, 161)
     l = np.linspace(rest - 0.1 * (l_most - rest), l_most + 0.05 * (l_most - rest), 121)  # noqa: E741  the source's symbol
-    turned = plant.bellows_radius_m * phi[None, :]
-    F = holding_force(plant, np.stack([l[:, None] + turned, l[:, None] - turned], axis=-1))
+    F = holding_force(plant, bellows(phi, l[:, None], plant.bellows_radius_m))
     spare = np.minimum(F, largest_force_N(model) - F).min(axis=-1)
     levels = np.array([0.0, spare.max()])
     # One light shade.

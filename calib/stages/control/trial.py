@@ -27,6 +27,8 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.camera.model import undistort
 from calib.stages.control.laws import (
+    ANGLE_PIDS,
+    LENGTHS_PD,
     BackOrientation,
     ComputedTorque,
     FeedForward,
@@ -52,9 +54,7 @@ CONTROLLERS = (
 
 _ANGLE = ("p", "pid", "clamping", "back", "tuned-pid", "torque")
 _LENGTHS = ("pd", "pd+ff", "pd+map", "tuned-pd", "torque")
-_SOURCE_PID = Pid(1000.0, 1000.0, 10.0)
-_SOURCE_PD = {"ellipse": Pid(10000.0, 0.0, 1000.0)}
-_PD = Pid(15000.0, 0.0, 150.0)
+_ELLIPSE_PD = Pid(10000.0, 0.0, 1000.0)
 _BACK_S, _SHARE = 4.0, 0.4
 
 
@@ -134,7 +134,7 @@ def _position(model: Model, reference: Reference, pid: Pid, extra: str) -> Law:
     added = np.zeros_like(reference.q_m)
     if extra == "map":
         added = feed_forward_pwm(model, reference.q_m)
-    elif extra == "line":
+    elif extra == "ff":
         added = feed_forward(FeedForward(), reference.q_m)
     return length_law(_with_limits(model, pid), reference.q_m, added)
 
@@ -194,12 +194,10 @@ def _law(
     section: Controller | None,
     sensors: bool,
 ) -> Law:
-    if name == "p":
-        return _orientation(model, reference, Pid(_SOURCE_PID.Kp))
-    if name in ("pid", "clamping"):
-        return _orientation(model, reference, replace(_SOURCE_PID, clamping=name == "clamping"))
+    if name in ANGLE_PIDS:
+        return _orientation(model, reference, ANGLE_PIDS[name])
     if name == "back":
-        return _back(reference, _back_of(model, _SOURCE_PID, _BACK_S, _SHARE))
+        return _back(reference, _back_of(model, ANGLE_PIDS["pid"], _BACK_S, _SHARE))
     if name == "tuned-pid":
         own = _tuned(section).orientation
         pid = Pid(own.Kp_pwm_per_rad, own.Ki_pwm_per_rad_s, own.Kd_pwm_s_per_rad)
@@ -210,14 +208,12 @@ def _law(
         return _position(model, reference, pid, "map")
     if name == "torque":
         known = None if section is None else section.computed_torque
-        control = (
-            ComputedTorque()
-            if known is None
-            else ComputedTorque(known.horizon_ticks, known.Kp_per_s2, known.Kd_per_s)
-        )
+        control = ComputedTorque()
+        if known is not None:
+            control = ComputedTorque(known.horizon_ticks, known.Kp_per_s2, known.Kd_per_s)
         return _Torque(rig, model, reference, control, sensors)
-    pid = _SOURCE_PD.get(reference.name, _PD)
-    return _position(model, reference, pid, {"pd": "", "pd+ff": "line", "pd+map": "map"}[name])
+    pid = _ELLIPSE_PD if reference.name == "ellipse" else LENGTHS_PD
+    return _position(model, reference, pid, name.partition("+")[2])
 
 
 def run_controller(

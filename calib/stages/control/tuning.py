@@ -612,6 +612,12 @@ def _pair(error: FloatArray) -> tuple[float, float]:
     return rms(error[:, 0]), rms(error[:, 1])
 
 
+def _step(tick_s: float, phi: FloatArray, before: float, wanted: float) -> tuple[float, float | None]:
+    """Overshoot [rad] of angles (n,) after a step between two, and when they settle."""
+    over = float(np.max(np.sign(wanted - before) * (phi - wanted)))
+    return max(over, 0.0), settling_s(tick_s, phi - wanted, _BAND * abs(wanted - before))
+
+
 def tracking(
     reference: Reference, q_m: FloatArray, pwm: FloatArray, bellows_radius_m: float, low: float, high: float
 ) -> Tracking:
@@ -624,32 +630,27 @@ def tracking(
     judged = t >= reference.judged_from_s - 1e-9
     if not judged.any():
         judged[:] = True
-    error = 1e3 * (reference.q_m - q_m)
-    turned = reference.phi_rad - phi
     free = reference.kind == "angle"
-    head = forward(q_m, bellows_radius_m)[:, :2] - forward(reference.q_m, bellows_radius_m)[:, :2]
-    nothing = (float("nan"), float("nan"))
+    wanted_m = np.full_like(q_m, np.nan) if free else reference.q_m
+    error = 1e3 * (wanted_m - q_m)
+    turned = reference.phi_rad - phi
+    head = forward(q_m, bellows_radius_m)[:, :2] - forward(wanted_m, bellows_radius_m)[:, :2]
     rise = reach = over = settle = jump_over = jump_settle = None
     if free and len(np.unique(reference.phi_rad)) <= 2 and reference.phi_rad[0] != 0.0:
         jump = len(phi) if reference.jump_s is None else round(reference.jump_s / h)
-        wanted, way = float(reference.phi_rad[0]), float(np.sign(reference.phi_rad[0]))
-        first = phi[:jump]
-        rise = _first(h, way * first >= 0.95 * abs(wanted))
-        reach = _first(h, way * first >= abs(wanted))
-        over = max(float(np.max(way * (first - wanted))), 0.0)
-        settle = settling_s(h, first - wanted, _BAND * abs(wanted))
+        wanted, first = float(reference.phi_rad[0]), phi[:jump]
+        along = np.sign(wanted) * first
+        rise, reach = (_first(h, along >= share * abs(wanted)) for share in (0.95, 1.0))
+        over, settle = _step(h, first, 0.0, wanted)
         if jump < len(phi):
-            then, end = phi[jump:], float(reference.phi_rad[-1])
-            way = float(np.sign(end - wanted))
-            jump_over = max(float(np.max(way * (then - end))), 0.0)
-            jump_settle = settling_s(h, then - end, _BAND * abs(end - wanted))
+            jump_over, jump_settle = _step(h, phi[jump:], wanted, float(reference.phi_rad[-1]))
     return Tracking(
-        nothing if free else _pair(error[judged]),
-        float("nan") if free else rms(1e3 * np.linalg.norm(head[judged], axis=1)),
+        _pair(error[judged]),
+        rms(1e3 * np.linalg.norm(head[judged], axis=1)),
         rms(turned[judged]),
-        float("nan") if free else float(np.abs(error[judged]).max()),
+        float(np.abs(error[judged]).max()),
         float(np.abs(turned[judged]).max()),
-        nothing if free else _pair(error),
+        _pair(error),
         rise,
         reach,
         over,

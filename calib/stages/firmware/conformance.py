@@ -83,6 +83,18 @@ def late(given: Inputs) -> float:
     return given.late_ticks if known else 1.0
 
 
+def settled(own: bool, decided: int | None, bit: int, off: float) -> tuple[bool, float]:
+    """A decision as the firmware's flags have it, and where that is another how far it was from the limit.
+
+    Parameters
+    ----------
+    decided : flags of the firmware, None where the reference decides. off : distance of the reference's value
+        from the limit.
+    """
+    differs = decided is not None and bool(decided & bit) != own
+    return own != differs, off if differs else 0.0
+
+
 def clip(value: float, limit: float) -> float:
     """A value within +-limit."""
     return min(max(value, -limit), limit)
@@ -159,11 +171,14 @@ class Reference:
         else:
             m.integral = clip(m.integral + c["MM_KI_DT2"] * e, c["MM_INTEGRAL_LIMIT_RAD"])
             m.phi += c["MM_KP_DT"] * e + m.integral - c["MM_DT_S"] * gz
-        if abs(m.phi) > c["PHI_LIMIT_RAD"]:
-            m.phi = clip(m.phi, c["PHI_LIMIT_RAD"])
-            flags |= ANGLE_LIMIT
         m.imu_age = 0
-        return flags
+        return flags | self._limited()
+
+    def _limited(self) -> int:
+        """Cut the angle to its limit; the flag where that cuts."""
+        phi, limit = self.memory.phi, self.c["PHI_LIMIT_RAD"]
+        self.memory.phi = clip(phi, limit)
+        return ANGLE_LIMIT if abs(phi) > limit else 0
 
     def undistorted(self, u_px: float, v_px: float) -> tuple[float, float]:
         """Normalised coordinates without the lens, by the header's polynomial."""
@@ -304,9 +319,8 @@ class Reference:
             u, more = Kpd * e - Kd_h * e1 + m.sum[i], half * (e + e1)
             whole = u + more
             clamp = bool(c[f"{stem}_CLAMPING"]) and half != 0.0 and not low <= whole <= high
-            if decided is not None and bool(decided & CLAMPED[i]) != clamp:
-                undecided = max(undecided, min(abs(whole - low), abs(whole - high)))
-                clamp = not clamp
+            clamp, off = settled(clamp, decided, CLAMPED[i], min(abs(whole - low), abs(whole - high)))
+            undecided = max(undecided, off)
             if clamp:
                 flags |= CLAMPED[i]
             else:
@@ -314,10 +328,9 @@ class Reference:
                 u = whole
             m.error[i] = e
             u += extra[i]
-            saturated = not low <= u <= high
-            if decided is not None and bool(decided & SATURATED[i]) != saturated:
-                undecided = max(undecided, min(abs(u - low), abs(u - high)))
-                saturated = not saturated
+            off = min(abs(u - low), abs(u - high))
+            saturated, off = settled(not low <= u <= high, decided, SATURATED[i], off)
+            undecided = max(undecided, off)
             if saturated:
                 flags |= SATURATED[i]
                 m.sum[i] += c[f"{stem}_BACK"] * (min(max(u, low), high) - u)
@@ -330,8 +343,7 @@ class Reference:
         """Flags, head, lengths, and how far a decision that went otherwise was from its limit [m]."""
         c, m = self.c, self.memory
         del decided
-        flags = self._angle(given)
-        phi = m.phi
+        flags, phi = self._angle(given), m.phi
         seen, afresh = self._marker(given)
         flags |= seen
         if m.marker_age == _NEVER:
@@ -454,7 +466,7 @@ class FusedReference(Reference):
         self, then: float, age: int, afresh: bool, sampled: bool, decided: int | None
     ) -> tuple[int, float, bool, float]:
         """Flags, correction of the angle, whether it stands alone, and what was undecided [m]."""
-        c, m, f, flags, undecided = self.c, self.memory, self.fused, 0, 0.0
+        c, m, f, flags = self.c, self.memory, self.fused, 0
         sh, ch, d = math.sin(0.5 * then), math.cos(0.5 * then), c["MARKER_OFFSET_M"]
         X, Y = m.marker
         across, along = X * ch - (Y + d) * sh, X * sh + (Y - d) * ch
@@ -467,9 +479,7 @@ class FusedReference(Reference):
             f.follow(c["FUSED_BOOST"] * e)
             return 0, clip(c["FUSED_BOOST_PHI_PER_M"] * across, c["FUSED_BOOST"]), True, 0.0
         far = max(abs(across), abs(e)) - c["FUSED_GATE_M"]
-        rejected = far > 0.0
-        if decided is not None and bool(decided & REJECTED) != rejected:
-            rejected, undecided = not rejected, abs(far)
+        rejected, undecided = settled(far > 0.0, decided, REJECTED, abs(far))
         if rejected:
             f.rejected += 1
             f.rate *= c["FUSED_RATE_DECAY"]
@@ -479,9 +489,8 @@ class FusedReference(Reference):
         f.rejected = 0
         f.slow += c["FUSED_SLOW"] * (e - f.slow)
         over = max(abs(f.slow) - c["FUSED_MOVING_M"], abs(f.rate) - c["FUSED_STILL_M"])
-        moves = over > 0.0
-        if decided is not None and bool(decided & MOVING) != moves:
-            moves, undecided = not moves, max(undecided, abs(over))
+        moves, off = settled(over > 0.0, decided, MOVING, abs(over))
+        undecided = max(undecided, off)
         if moves:
             f.moving, flags = int(c["FUSED_MOVING_TICKS"]), MOVING
         else:
@@ -516,13 +525,10 @@ class FusedReference(Reference):
             told, more, alone, undecided = self._picture(then, age, afresh, sampled, decided)
             flags |= told
             correction = more if alone else correction + more
-        limit = c["PHI_LIMIT_RAD"]
         if sampled and not f.boost:
             f.bias = clip(f.bias + c["FUSED_BIAS"] * correction, c["MM_INTEGRAL_LIMIT_RAD"])
         m.phi += correction
-        if abs(m.phi) > limit:
-            m.phi = clip(m.phi, limit)
-            flags |= ANGLE_LIMIT
+        flags |= self._limited()
         turned = c["BELLOWS_RADIUS_M"] * m.phi
         head = (f.chord * math.sin(0.5 * then), f.chord * math.cos(0.5 * then))
         return flags, head, (f.length + turned, f.length - turned), undecided

@@ -22,7 +22,7 @@ from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficien
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.camera.pose import homography_with_lens, plane_pixels
-from calib.stages.control.laws import PWM_MIN, FeedForward, Pid
+from calib.stages.control.laws import ANGLE_PIDS, LENGTHS_PD, PWM_MIN, FeedForward, Pid
 from calib.stages.control.section import OrientationGains, StaticMap
 from calib.stages.estimator import constant_gain
 from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, SHAKING_RADPS2, TickNoise
@@ -293,8 +293,6 @@ def _lowpass(lookup: Lookup) -> list[dict[str, Any]]:
 #
 #     u_k = (Kp + Kd / dt + Ki dt / 2) e_k + (P_(k-1) - Kd / dt e_(k-1)),   P_k = P_(k-1) + Ki dt e_k.
 
-_ORIENTATION = Pid(1000.0, 1000.0, 10.0, clamping=True)
-_POSITION = Pid(15000.0, 0.0, 150.0)
 _TABLE_STEP_M = 0.002
 
 
@@ -505,9 +503,9 @@ def constants(lookup: Lookup, plane: PlaneConstants | None) -> dict[str, Any]:
         "series": [float(c) for c in inverse_coefficients()],
         "fused": _fused(lookup, rate_hz, delay, plane, imu, rest),
         "pwm": pwm,
-        "orientation": _pid(lookup, "orientation", "rad", _ORIENTATION, rate_hz),
+        "orientation": _pid(lookup, "orientation", "rad", ANGLE_PIDS["clamping"], rate_hz),
         "orientation_sign": round(lookup.number("controller.orientation.sign", 1)),
-        "position": _pid(lookup, "position", "m", _POSITION, rate_hz),
+        "position": _pid(lookup, "position", "m", LENGTHS_PD, rate_hz),
         "feed": feed,
         "envelope": _envelope(lookup, rate_hz, pwm, feed, radius, rest),
         "defaults": list(lookup.missing),
