@@ -178,7 +178,6 @@ def test_filtering_is_the_firmwares_difference_equation() -> None:
     for before, value in pairwise(x):
         out.append(b0 * (before + value) - a1 * out[-1])
     np.testing.assert_allclose(filter_signal(exact, x), out, rtol=0.0, atol=1e-13)
-    assert filter_signal(exact, x[:0]).shape == (0,)
     assert filter_signal(exact, x[:1]) == pytest.approx(x[:1])
 
 

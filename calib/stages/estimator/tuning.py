@@ -66,7 +66,7 @@ def tuned_section(
 
     Raises `BadInputError` for logs that cannot be used, or without camera and IMU.
     """
-    every, first, at_rest = [], None, None
+    every, setups, rests = [], [], []
     bare = replace(rig, estimator=None)
     drive = drive_from_rig(bare)
     for path in logs:
@@ -80,14 +80,12 @@ def tuned_section(
             if count >= _MOST_ROWS:
                 break
         every.append(Rows.joined(parts))
-        if first is None:
-            first, at_rest = source.setup, noise_at_rest(bare, source.periods)
-    if first is None:
-        raise BadInputError("LOG: none given, expected at least one")
-    found_noise = tune(first, every, progress)
+        setups.append(source.setup)
+        rests.append(noise_at_rest(bare, source.periods))
+    found_noise = tune(setups[0], every, progress)
     sigma = {"jitter_px": found_noise.jitter_px.sigma}
     sigma |= {name: factor.sigma for name, factor in found_noise.factors.items()}
-    driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=at_rest), every, progress)
+    driven, more = _driven_section(found_noise.setup, replace(drive, imu_noise=rests[0]), every, progress)
     sigma |= more
     findings = []
     if found_noise.jitter_px.sigma is None:

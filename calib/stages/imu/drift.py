@@ -17,6 +17,7 @@ from calib.core.arrays import BoolArray, FloatArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Verdict
+from calib.solve.delay import vertex
 from calib.stages.imu.allan import allan_variance
 from calib.stages.imu.mahony import Mahony, mean_angle, wrapped
 from calib.stages.imu.sampling import (
@@ -211,9 +212,7 @@ def lag_s(
     i = int(np.argmax(c))
     if i in (0, len(c) - 1) or c[i] < least:
         return math.nan
-    bend = c[i - 1] - 2.0 * c[i] + c[i + 1]
-    fraction = 0.5 * (c[i - 1] - c[i + 1]) / bend if bend < 0.0 else 0.0
-    return float((lags[i] + fraction) * period_s)
+    return float((lags[i] + vertex(*(-c[i - 1 : i + 2]).tolist())) * period_s)
 
 
 def truth_late_s(

@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
-from calib.core.errors import BadInputError
 from calib.core.units import GRAVITY_MPS2
 
 # ----------------------------------------------------------------------
@@ -70,8 +69,6 @@ class Levelling:
     velocity_mps : standard deviation of the sensor's velocity; with the next two it makes the start.
     angle_rad, bias_radps : standard deviations of the angle and of the rate's bias at the first sample.
     bias_tau_s : time constant of the settled bias.
-
-    Raises `BadInputError` for values that are not positive and finite.
     """
 
     tau_s: float = 2.0
@@ -79,13 +76,6 @@ class Levelling:
     angle_rad: float = 0.1
     bias_radps: float = 0.02
     bias_tau_s: float = 25.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 < value < math.inf:
-                raise BadInputError(
-                    f"{name} of the levelling filter: found {value:g}, expected more than zero"
-                )
 
     @property
     def densities(self) -> tuple[float, float, float]:
@@ -327,22 +317,10 @@ def level_three(
 
     Parameters
     ----------
-    t_s : (n,) time stamps that do not go back.
+    t_s : (n,) time stamps that do not go back, one or more.
     force_mps2, gyro_radps : (n, 3) finite readings.
-
-    Raises
-    ------
-    BadInputError for shapes that differ, time that goes back and values that are not finite.
     """
-    t = np.ascontiguousarray(t_s, dtype=np.float64)
-    force, gyro = (np.ascontiguousarray(x, dtype=np.float64) for x in (force_mps2, gyro_radps))
-    if force.shape != (len(t), 3) or gyro.shape != (len(t), 3) or len(t) == 0:
-        raise BadInputError(
-            f"levelling filter: found times {t.shape}, specific forces {force.shape} and rates {gyro.shape}, "
-            "expected (n,), (n, 3) and (n, 3)"
-        )
-    if not (np.isfinite(force).all() and np.isfinite(gyro).all() and (np.diff(t) >= 0.0).all()):
-        raise BadInputError("levelling filter: expected finite readings and time that runs forward")
+    t, force, gyro = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, force_mps2, gyro_radps))
     out = np.empty_like(force)
     _run_three(t, force / GRAVITY_MPS2, gyro, parameters.densities, _covariance(parameters), out)
     return out

@@ -9,7 +9,6 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.compilation import kernel
-from calib.core.errors import BadInputError
 from calib.stages.imu.levelling import Levelling
 
 # ----------------------------------------------------------------------
@@ -27,18 +26,10 @@ from calib.stages.imu.levelling import Levelling
 
 @dataclass(frozen=True)
 class Mahony:
-    """Gains Kp [1/s] and Ki [1/s^2]; the source has 3 and 3.
-
-    Raises `BadInputError` for gains that are negative or not finite.
-    """
+    """Gains Kp [1/s] and Ki [1/s^2]; the source has 3 and 3."""
 
     Kp: float = 3.0
     Ki: float = 3.0
-
-    def __post_init__(self) -> None:
-        for name, gain in (("Kp", self.Kp), ("Ki", self.Ki)):
-            if not 0.0 <= gain < math.inf:
-                raise BadInputError(f"{name} of the angle filter: found {gain:g}, expected zero or more")
 
     def fill(
         self, t: FloatArray, phi_acc: FloatArray, w: FloatArray, phi: FloatArray, integral: FloatArray
@@ -133,8 +124,8 @@ def filter_log(
     Parameters
     ----------
     parameters : of either filter. The levelling filter takes the rate as straight between samples.
-    t_s : (n,) time stamps that do not go back.
-    phi_acc_rad : (n,) accelerometer's angles (2.1), wrapped or not.
+    t_s : (n,) time stamps that do not go back, one or more.
+    phi_acc_rad : (n,) accelerometer's angles (2.1), wrapped or not, finite as the rate.
     rate_radps : (n,) rate of phi, which is -gz of a sensor in the plane.
     start : state at the first sample, whose own step is zero; without it the first accelerometer's
         angle and no integral.
@@ -142,19 +133,8 @@ def filter_log(
     Returns
     -------
     phi_rad (n,), not wrapped, and integral_radps (n,), which goes to minus the bias of the rate.
-
-    Raises
-    ------
-    BadInputError for lengths that differ, time that goes back and values that are not finite.
     """
     t, phi_acc, w = (np.ascontiguousarray(x, dtype=np.float64) for x in (t_s, phi_acc_rad, rate_radps))
-    if t.ndim != 1 or t.shape != phi_acc.shape or t.shape != w.shape or len(t) == 0:
-        raise BadInputError(
-            f"angle filter: found times {t.shape}, angles {phi_acc.shape} and rates {w.shape}, "
-            "expected as many of each and at least one"
-        )
-    if not (np.isfinite(phi_acc).all() and np.isfinite(w).all() and (np.diff(t) >= 0.0).all()):
-        raise BadInputError("angle filter: expected finite readings and time that runs forward")
     state = MahonyState(float(phi_acc[0]), 0.0) if start is None else start
     phi, integral = np.empty(len(t)), np.empty(len(t))
     phi[0], integral[0] = state.phi_rad, state.integral_radps

@@ -273,8 +273,6 @@ def analyse_static(logs: Sequence[Readings]) -> Static:
     ------
     BadInputError for logs without a stretch at rest, and for logs of different axes or rates.
     """
-    if not logs:
-        raise BadInputError("logs: found none, expected at least one")
     axes = logs[0].axes
     for log in logs[1:]:
         if log.axes != axes:

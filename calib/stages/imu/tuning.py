@@ -789,11 +789,7 @@ def tune(pieces: Sequence[Piece], sensor: Noise) -> Tuning:
     ----------
     pieces : logs of the same rate; where one has a reference, only those that have one are judged.
     sensor : densities of the sensor; the accelerometer's is that of a log too short to tell its own.
-
-    Raises `BadInputError` for no logs at all.
     """
-    if not pieces:
-        raise BadInputError("logs: found none, expected at least one")
     smoothed = tuple(_smoothed(piece, sensor) for piece in pieces)
     spans = [len(piece.t_s) for piece in pieces]
     known = [(n, s.accel_noise) for n, s in zip(spans, smoothed, strict=True) if s is not None]
@@ -1063,60 +1059,54 @@ def _later(t_s: FloatArray, phi_acc_rad: FloatArray, rate_radps: FloatArray) -> 
     return late, off_rad
 
 
-def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
-    """Findings on logs whose rate, accelerometer and reference do not speak of the same motion.
+def _contradiction(piece: Piece, own: Smoothed | None, noise: Noise) -> tuple[str, Severity] | None:
+    """What in a log contradicts what else of it, and how badly; None where all speaks of one motion.
 
     A rate that errs is "poor" alone, for a sensor that lies flat errs as one with wrong columns does.
     """
+    t_s, rate, seen = piece.t_s, piece.rate_radps, piece.reference_rad
+    if seen is not None and (what := _against(t_s, rate, seen)):
+        return f"rate and reference contradict each other: {what}", "inconsistent"
+    if own is None or not piece.in_plane:
+        return None
+    if seen is not None and (what := _slowly(t_s, own.phi_rad, seen)):
+        return f"accelerometer and reference contradict each other: {what}", "inconsistent"
+    if abs(late_s := _late(t_s, piece.phi_acc_rad, rate)) > _MOST_LATE_S:
+        return f"{_lateness(late_s)}, or it is pushed in step with its turns", "inconsistent"
+    if (errs := _rate_error(piece, own)) > max(_TIMES_THE_SENSOR * noise.gyro, _MOST_RATE_ERROR):
+        return (
+            "rate and accelerometer contradict each other: the rate, unless the sensor is pushed for "
+            f"seconds, errs by {math.degrees(errs):.2g} deg/s/sqrt(Hz), the sensor by "
+            f"{math.degrees(noise.gyro):.2g}"
+        ), "poor"
+    if abs(own.scale - 1.0) - _SURE * own.scale_sigma > _MOST_SCALE and _off(own) > _TURNS_RAD:
+        what = f"the rate turns {own.scale:.3g} times as far as the accelerometer's angle"
+        return f"rate and accelerometer contradict each other: {what}", "poor"
+    late_s, off_rad = _later(t_s, piece.phi_acc_rad, rate)
+    if off_rad > _TURNS_RAD:
+        turned = f"which is {math.degrees(off_rad):.2g} deg (RMS) in these turns"
+        return f"{_lateness(late_s)}, {turned}, or it is pushed in step with them", "inconsistent"
+    return None
+
+
+def _lateness(late_s: float) -> str:
+    when = "later" if late_s > 0.0 else "earlier"
+    return f"the accelerometer's angle comes {1e3 * abs(late_s):.0f} ms {when} than the rate's"
+
+
+def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
+    """Findings on logs whose rate, accelerometer and reference do not speak of the same motion."""
     out: dict[str, Finding] = {}
 
-    def found(source: str, what: str, severity: Severity = "inconsistent") -> None:
+    def found(source: str, what: str, severity: Severity) -> None:
         advice = "check the columns, signs and units of that log"
         # A rate that errs alone may be that of a sensor that lies flat.
         advice += ", and that gravity lies in its x-y plane" if severity == "poor" else ""
         out.setdefault(source, Finding(severity, f"{source}: {what}", advice))
 
     for piece, own in zip(pieces, result.smoothed, strict=True):
-        if piece.reference_rad is not None:
-            what = _against(piece.t_s, piece.rate_radps, piece.reference_rad)
-            if what:
-                found(piece.source, f"rate and reference contradict each other: {what}")
-            elif piece.in_plane and own is not None:
-                what = _slowly(piece.t_s, own.phi_rad, piece.reference_rad)
-                if what:
-                    found(piece.source, f"accelerometer and reference contradict each other: {what}")
-        if piece.in_plane and own is not None:
-            late = _late(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
-            if abs(late) > _MOST_LATE_S:
-                when = "later" if late > 0.0 else "earlier"
-                found(
-                    piece.source,
-                    f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's, or "
-                    "it is pushed in step with its turns",
-                )
-            elif (errs := _rate_error(piece, own)) > max(
-                _TIMES_THE_SENSOR * result.noise.gyro, _MOST_RATE_ERROR
-            ):
-                found(
-                    piece.source,
-                    "rate and accelerometer contradict each other: the rate, unless the sensor is pushed for "
-                    f"seconds, errs by {math.degrees(errs):.2g} deg/s/sqrt(Hz), the sensor by "
-                    f"{math.degrees(result.noise.gyro):.2g}",
-                    "poor",
-                )
-            elif abs(own.scale - 1.0) - _SURE * own.scale_sigma > _MOST_SCALE and _off(own) > _TURNS_RAD:
-                what = f"the rate turns {own.scale:.3g} times as far as the accelerometer's angle"
-                found(piece.source, f"rate and accelerometer contradict each other: {what}", "poor")
-            else:
-                late, off_rad = _later(piece.t_s, piece.phi_acc_rad, piece.rate_radps)
-                if off_rad > _TURNS_RAD:
-                    when = "later" if late > 0.0 else "earlier"
-                    found(
-                        piece.source,
-                        f"the accelerometer's angle comes {1e3 * abs(late):.0f} ms {when} than the rate's, "
-                        f"which is {math.degrees(off_rad):.2g} deg (RMS) in these turns, or it is pushed "
-                        "in step with them",
-                    )
+        if (what := _contradiction(piece, own, result.noise)) is not None:
+            found(piece.source, *what)
     offsets = [
         (piece.source, offset)
         for piece, offset in zip(pieces, result.offset_rad, strict=True)
@@ -1130,6 +1120,7 @@ def contradictions(pieces: Sequence[Piece], result: Tuning) -> list[Finding]:
                 source,
                 f"the angle of its accelerometer differs from the reference by {math.degrees(apart):.3g} deg "
                 "more than that of the other logs, as if the sensor were mounted otherwise",
+                "inconsistent",
             )
     return list(out.values())
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from calib.core.arrays import ComplexArray, FloatArray
 from calib.core.errors import BadInputError
@@ -63,12 +62,7 @@ class Ticks:
 
 
 def on_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
-    """The samples (n, d), taken at times (n,) that do not run backwards, one per tick.
-
-    Raises `BadInputError` for no samples.
-    """
-    if len(t_s) == 0:
-        raise BadInputError("has no samples")
+    """The samples (n, d), one or more, taken at times (n,) that do not run backwards, one per tick."""
     breaks = np.nonzero(np.diff(t_s) > max(LONGEST_HOLD_S, 2.0 / rate_hz))[0] + 1
     pieces, held, dropped = [], 0, 0
     for first, last in zip([0, *breaks.tolist()], [*breaks.tolist(), len(t_s)], strict=True):
@@ -316,11 +310,11 @@ class StepResponse:
     overshoot: float
 
 
-def _z(f_hz: FloatArray, rate_hz: float) -> npt.NDArray[np.complex128]:
+def _z(f_hz: FloatArray, rate_hz: float) -> ComplexArray:
     return np.asarray(np.exp(-2j * np.pi * np.asarray(f_hz) / rate_hz))
 
 
-def frequency_response(sections: FloatArray, f_hz: FloatArray, rate_hz: float) -> npt.NDArray[np.complex128]:
+def frequency_response(sections: FloatArray, f_hz: FloatArray, rate_hz: float) -> ComplexArray:
     """H (n,) at frequencies (n,) [Hz] of sections (k, 6)."""
     z = _z(f_hz, rate_hz)
     H = np.ones(z.shape, dtype=np.complex128)
@@ -329,7 +323,7 @@ def frequency_response(sections: FloatArray, f_hz: FloatArray, rate_hz: float) -
     return H
 
 
-def decibels(H: npt.NDArray[np.complex128] | FloatArray) -> FloatArray:
+def decibels(H: ComplexArray) -> FloatArray:
     """20 log10 |H|, at least -400."""
     return np.asarray(20.0 * np.log10(np.maximum(np.abs(H), 10.0 ** (_FLOOR_DB / 20.0))))
 
@@ -365,11 +359,9 @@ def settled_state(sections: FloatArray, first: FloatArray) -> FloatArray:
 
 
 def filter_signal(sections: FloatArray, x: FloatArray) -> FloatArray:
-    """Filtered signal (n, ...) along the first axis, started without a transient; `x` has no NaN."""
+    """Filtered signal (n, ...), n > 0, along the first axis, started without a transient; `x` has no NaN."""
     from scipy.signal import sosfilt
 
-    if len(x) == 0:
-        return np.array(x, dtype=np.float64)
     y, _ = sosfilt(sections, x, axis=0, zi=settled_state(sections, np.asarray(x[0])))
     return np.asarray(y, dtype=np.float64)
 
