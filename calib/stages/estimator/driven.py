@@ -1080,6 +1080,39 @@ def _due(
 
 
 @kernel(arrays=False)
+def _waits(kind: int, when: float, whole: IntArray, real: FloatArray) -> bool:
+    """Whether the filter, which has not started or starts again, may begin at an event."""
+    waits = whole[_STARTED] == 0 or whole[_PENDING] == 1
+    # Who holds the head until the log begins is not in the model.
+    return bool(kind == CAMERA and waits and when > real[_FIRST] + _BEFORE_S)
+
+
+@kernel(arrays=False)
+def _begun(
+    x: FloatArray, P: FloatArray, when: float, z: FloatArray, whole: IntArray, real: FloatArray, model: Model,
+    g: FloatArray,
+) -> bool:  # fmt: skip
+    """Begin at a picture z if it shows a head that a rig can have; g as of `begin_again`."""
+    if not begin_again(x, P, model, z, not math.isnan(real[_BEGUN]), whole[_HOSES] == 1, g):
+        return False
+    whole[_STARTED], whole[_PENDING], real[_BEGUN] = 1, 0, when
+    return True
+
+
+@kernel(arrays=False)
+def _count_rejected(report: FloatArray, whole: IntArray, real: FloatArray) -> None:
+    """Count what an event's report says of rejected readings; after many the filter starts again."""
+    for k in range(3):
+        at = _REJECTED if k == 0 else _REJECTED_IMU
+        if report[8 + k] == 1.0:
+            real[at] += 1.0
+        elif report[8 + k] == 0.0:
+            real[at] *= 0.7
+    if real[_REJECTED] > _LOCKED_OUT or real[_REJECTED_IMU] > 2.0 * _LOCKED_OUT:
+        whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 1, 0.0, 0.0
+
+
+@kernel(arrays=False)
 def _do_again(
     own: int, first: int, begin: bool, afresh: bool, events: Events, memory: Memory, model: Model, room: Room
 ) -> int:
@@ -1102,13 +1135,10 @@ def _do_again(
                 x, P, events.t[before], events.t[now], events.let_go[now], model, switches, whole[_SWITCH],
                 room.F, room.work,
             )  # fmt: skip
-        again, driven = not math.isnan(real[_BEGUN]), whole[_HOSES] == 1
-        if (now == own and begin
-                and begin_again(x, P, model, z, again, driven, switches.g[whole[_SWITCH]])):  # fmt: skip
-            if whole[_STARTED] == 1:
-                flags |= 1
-            whole[_STARTED], whole[_PENDING] = 1, 0
-            real[_BEGUN] = events.t[now]
+        started = whole[_STARTED] == 1
+        if now == own and begin:
+            g = switches.g[whole[_SWITCH]]
+            flags |= int(_begun(x, P, events.t[now], z, whole, real, model, g) and started)
         if events.kind[now] == IMU and events.t[now] < real[_BEGUN] + SETTLING_S:
             z[0], z[1], gated[1] = math.nan, math.nan, 1.0
         if (whole[_STARTED] == 0 and events.kind[now] != HOSES) or events.kind[now] == 0:
@@ -1229,9 +1259,7 @@ def run_driven(
                 events.let_go[own], events.let_go[after] = events.let_go[after], math.nan
             for k in range(4):
                 events.z[own, k] = room.z[k]
-            # Who holds the head until the log begins is not in the model.
-            begin = (kind == CAMERA and (whole[_STARTED] == 0 or whole[_PENDING] == 1)
-                     and when > real[_FIRST] + _BEFORE_S)  # fmt: skip
+            begin = _waits(kind, when, whole, real)
             found, let_go_s = _taken(own, back, begin, events, memory, model, room)
             flags |= found
             if not math.isnan(let_go_s):
@@ -1240,14 +1268,7 @@ def run_driven(
             if kind == HOSES or kind == 0:
                 report[:] = math.nan
             settle_event(whole, size, report, out, row)
-            for k in range(3):
-                at = _REJECTED if k == 0 else _REJECTED_IMU
-                if report[8 + k] == 1.0:
-                    real[at] += 1.0
-                elif report[8 + k] == 0.0:
-                    real[at] *= 0.7
-            if real[_REJECTED] > _LOCKED_OUT or real[_REJECTED_IMU] > 2.0 * _LOCKED_OUT:
-                whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 1, 0.0, 0.0
+            _count_rejected(report, whole, real)
         here = whole[NEWEST]
         ahead = stamp - events.t[here] if whole[COUNT] > 0 else 0.0
         if whole[_STARTED] == 0:
@@ -1337,22 +1358,21 @@ assert SIZE == 20
 # of what was before. The backward pass begins anew every `WINDOW` events, from events `OVERLAP` further on.
 
 WINDOW, OVERLAP = 6000, 3000
-_SMOOTHER_BEGUN, _SMOOTHER_STARTED, _SMOOTHER_PENDING, _SMOOTHER_HOSES = range(2, 6)
-"""Marks of the forward pass, after the numbers of pictures and of IMU readings that were rejected."""
 _SHOWN = np.array([0, 1, 2, 3, INVOLVED])
 """States that the output needs: the motion and the gyroscope's bias."""
 
 
 @kernel(arrays=False)
 def _forward(
-    t: FloatArray, before_s: float, first_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray,
-    P: FloatArray, marks: FloatArray, switches: Switches, model: Model, kept_x: FloatArray,
+    t: FloatArray, before_s: float, kinds: IntArray, readings: FloatArray, x: FloatArray, P: FloatArray,
+    whole: IntArray, real: FloatArray, switches: Switches, model: Model, kept_x: FloatArray,
     kept_P: FloatArray, trace: FloatArray, F: FloatArray, chained: BoolArray, alive: BoolArray,
     let_go_s: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip
     """The filter over events, keeping what is shown; state and counters are those after the last one.
 
-    `let_go_s` (n,) has the time of a release in the event whose step it is in.
+    `whole` and `real` are of `Memory`; `let_go_s` (n,) has the time of a release in the event whose step it
+    is in.
     """
     report, gated, last = work[18, :12], work[19, :3], 0
     for k in range(len(t)):
@@ -1365,42 +1385,29 @@ def _forward(
         chained[k] = False
         trace[k, :, TRACE - 1] = 0.0
         if t[k] - begin > LONGEST_GAP_S:
-            marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 0, 0
-            marks[0], marks[1] = 0.0, 0.0
-        if marks[_SMOOTHER_STARTED] == 1:
+            whole[_STARTED], whole[_PENDING], real[_REJECTED], real[_REJECTED_IMU] = 0, 0, 0.0, 0.0
+        if whole[_STARTED] == 1:
             _stand(F[k])
             pass_on(x, P, begin, t[k], let_go_s[k], model, switches, last, F[k], work)
             chained[k] = True
         if kind == HOSES:
-            marks[_SMOOTHER_HOSES] = 1
-        waits = marks[_SMOOTHER_STARTED] == 0 or marks[_SMOOTHER_PENDING] == 1
-        again, driven = not math.isnan(marks[_SMOOTHER_BEGUN]), marks[_SMOOTHER_HOSES] == 1
-        if (waits and kind == CAMERA and t[k] > first_s + _BEFORE_S
-                and begin_again(x, P, model, z, again, driven, switches.g[last])):  # fmt: skip
-            marks[_SMOOTHER_STARTED], marks[_SMOOTHER_PENDING] = 1, 0
+            whole[_HOSES] = 1
+        if _waits(kind, t[k], whole, real) and _begun(x, P, t[k], z, whole, real, model, switches.g[last]):
             chained[k] = False
-            marks[_SMOOTHER_BEGUN] = t[k]
-        if kind == IMU and t[k] < marks[_SMOOTHER_BEGUN] + SETTLING_S:
+        if kind == IMU and t[k] < real[_BEGUN] + SETTLING_S:
             z[0], z[1] = math.nan, math.nan
-        if marks[_SMOOTHER_STARTED] == 1.0 and kind != 0:
+        if whole[_STARTED] == 1 and kind != 0:
             driven_event(x, P, kind, z, model, work, False, report, gated, trace[k])
-            for i in range(3):
-                if report[8 + i] == 1.0:
-                    marks[min(i, 1)] += 1.0
-                elif report[8 + i] == 0.0:
-                    marks[min(i, 1)] *= 0.7
+            _count_rejected(report, whole, real)
             if not sound(x, P, model.radius):
                 copy_state(x, P, model.x0, model.P0)
                 chained[k] = False
-                marks[_SMOOTHER_PENDING] = 1
-            elif marks[0] > _LOCKED_OUT or marks[1] > 2.0 * _LOCKED_OUT:
-                marks[_SMOOTHER_PENDING] = 1
-                marks[0], marks[1] = 0.0, 0.0
+                whole[_PENDING] = 1
         for i in range(len(_SHOWN)):
             kept_x[k, i] = x[_SHOWN[i]]
             for j in range(len(x)):
                 kept_P[k, i, j] = P[_SHOWN[i], j]
-        alive[k] = marks[_SMOOTHER_STARTED] == 1
+        alive[k] = whole[_STARTED] == 1
 
 
 @kernel(arrays=False)
@@ -1506,14 +1513,14 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, outputs: FloatArray) -
     t, kinds, readings, at, switches = _timeline(setup, drive, rows)
     model = drive.model(setup)
     x, P = model.x0.copy(), model.P0.copy()
-    marks = np.array([0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
+    whole, real = np.zeros(6, dtype=np.int64), np.array([0.0, 0.0, 0.0, 0.0, np.nan])
+    real[_FIRST] = rows.t_s[0] - setup.delay_s if len(rows) else 0.0
     out = outputs.copy()
     out[:, 1:13] = np.nan
     n, size, shown, work = len(t), len(DRIVEN), len(_SHOWN), np.zeros(WORK)
     let_go_s, told = np.full(n + 1, np.nan), outputs[np.isfinite(outputs[:, _LET_GO]), _LET_GO]
     let_go_s[np.searchsorted(t, told, side="right")] = told
     begin, before = 0, float(t[0]) if n else 0.0
-    begins_s = float(rows.t_s[0]) - setup.delay_s if n else 0.0
     while begin < n:
         end = min(begin + WINDOW, n)
         stop = min(end + OVERLAP, n)
@@ -1521,15 +1528,15 @@ def smooth_driven(setup: Setup, drive: Drive, rows: Rows, outputs: FloatArray) -
         kept_x, kept_P = np.empty((count, shown)), np.empty((count, shown, size))
         trace, F = np.empty((count, 3, TRACE)), np.empty((count, DYNAMIC, INVOLVED))
         chained, alive = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        state = x, P, marks
+        state = x, P, whole, real
         for first, behind in ((begin, end), (end, stop)):
             of, to = slice(first, behind), slice(first - begin, behind - begin)
             _forward(
-                t[of], before, begins_s, kinds[of], readings[of], *state, switches, model, kept_x[to],
-                kept_P[to], trace[to], F[to], chained[to], alive[to], let_go_s[of], work,
+                t[of], before, kinds[of], readings[of], *state, switches, model, kept_x[to], kept_P[to],
+                trace[to], F[to], chained[to], alive[to], let_go_s[of], work,
             )  # fmt: skip
             # The next window begins with the state at `end`; what is beyond only looks back.
-            before, state = float(t[end - 1]), (x.copy(), P.copy(), marks.copy())
+            before, state = float(t[end - 1]), (x.copy(), P.copy(), whole.copy(), real.copy())
         wanted = np.where(alive & (kinds[part] == 0), at[part], -1)
         wanted[end - begin :] = -1
         _backward(t[part], F, trace, chained, wanted, kept_x, kept_P)
