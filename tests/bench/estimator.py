@@ -63,7 +63,9 @@ def beside_filterpy() -> tuple[float, float, float]:
     rig, log = simulated("ellipse", 1)
     rows = rows_from(log)
     setup = setup_for(rig, 1, Kinematic(Kinematic().levels[2:3]))
-    events = smoother.events_of(setup, rows, outputs=False)
+    events = smoother.events_of(setup, rows)
+    some = events.kinds > 0
+    events = smoother.Events(*(values[some] for values in vars(events).values()))
     count = len(events.t_s)
     levels, walk = setup.process.arrays()
     gated = np.zeros((count, 3))

@@ -20,7 +20,7 @@ from scipy.stats import truncnorm
 
 import calib.stages.actuator
 import calib.stages.estimator
-from calib.core.arrays import FloatArray
+from calib.core.arrays import FloatArray, rms
 from calib.core.rig import Rig
 from calib.io.logs import Watch
 from calib.stages.actuator.kinematics import forward as forward_of_sensors
@@ -65,8 +65,11 @@ def nominal(name: str = "ellipse") -> tuple[Setup, Rows, FloatArray]:
     return setup_for(rig), rows_from(log), truth(log)
 
 
-def part(rows: Rows, keep: FloatArray | slice) -> Rows:
-    return Rows(rows.t_s[keep], rows.readings[keep].copy(), rows.kinds[keep].copy())
+def readings_of(setup: Setup, rows: Rows, until_s: float = math.inf) -> Events:
+    """Events of a log that have readings, up to a time."""
+    events = events_of(setup, rows)
+    some = (events.kinds > 0) & (events.t_s < until_s)
+    return Events(*(values[some] for values in vars(events).values()))
 
 
 def flag(out: FloatArray, name: str) -> FloatArray:
@@ -106,13 +109,13 @@ def test_blocks_make_no_difference() -> None:
     whole = Filter(setup).run(rows)
     parts = Filter(setup)
     cuts = [0, 1, 17, 300, 301, len(rows)]
-    pieces = [part(rows, slice(a, b)) for a, b in pairwise(cuts)]
-    np.testing.assert_array_equal(np.concatenate([parts.run(piece) for piece in pieces]), whole)
+    pieces = [parts.run(rows[a:b]) for a, b in pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(pieces), whole)
 
 
 def test_output_rests_on_the_past_alone() -> None:
     setup, rows, _ = nominal("swing")
-    whole, head = Filter(setup).run(rows), Filter(setup).run(part(rows, slice(0, 400)))
+    whole, head = Filter(setup).run(rows), Filter(setup).run(rows[:400])
     np.testing.assert_array_equal(head, whole[:400])
 
 
@@ -122,7 +125,7 @@ def test_late_pictures_end_in_the_state_of_the_right_order() -> None:
     rows = rows_from(log)
     late = Filter(setup)
     out = late.run(rows)
-    events = events_of(setup, rows, outputs=False)
+    events = readings_of(setup, rows)
     # The filter has begun with its first event and has gated what it has gated.
     x, P, w = starting_state(setup, rows)
     levels, walk = setup.process.arrays()
@@ -157,7 +160,7 @@ def test_a_blackout_is_survived_and_its_uncertainty_told() -> None:
 def test_camera_alone_works_and_says_so() -> None:
     setup, rows, true = nominal()
     rows.readings[:, 2:] = np.nan
-    out = Filter(setup).run(part(rows, rows.kinds == 1))
+    out = Filter(setup).run(rows[rows.kinds == 1])
     sane(out)
     assert flag(out, "imu_silent")[-1] and not flag(out, "imu_silent")[0]
     error = 1e3 * (out[out[:, 0] > 2.0, 1] - true[rows.kinds == 1][out[:, 0] > 2.0, 0])
@@ -167,7 +170,7 @@ def test_camera_alone_works_and_says_so() -> None:
 def test_imu_alone_works_is_bounded_and_says_so() -> None:
     setup, rows, true = nominal()
     rows.readings[:, :2] = np.nan
-    out = Filter(setup).run(part(rows, rows.kinds == 2))
+    out = Filter(setup).run(rows[rows.kinds == 2])
     sane(out)
     assert flag(out, "camera_silent")[-1]
     late = out[:, 0] > 2.0
@@ -246,9 +249,7 @@ def test_small_disorder_and_repeated_rows_do_little() -> None:
 
 def compiled(setup: Setup, rows: Rows, seconds: float) -> tuple[Events, OneLevel]:
     """Events of the first seconds and what the filter makes of them."""
-    events = smoother.events_of(setup, rows, outputs=False)
-    keep = events.t_s < rows.t_s[0] + seconds
-    events = Events(events.t_s[keep], events.kinds[keep], events.readings[keep], events.rows[keep])
+    events = readings_of(setup, rows, rows.t_s[0] + seconds)
     return events, one_level(setup, rows, events)
 
 
@@ -423,10 +424,6 @@ PERIOD = 0.01
 def jittered(count: int = 3000, jitter: float = 4e-4, seed: int = 0) -> tuple[FloatArray, FloatArray]:
     true = 5.0 + 1.0002 * PERIOD * np.arange(count)
     return true, true + jitter * np.random.default_rng(seed).standard_normal(count)
-
-
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def test_jitter_is_removed() -> None:

@@ -295,10 +295,6 @@ def settle_weights(weights: FloatArray, slot: int, log_likelihood: FloatArray, p
 # believed; the sample gets the time that was due. When ten in a row are not believed the clock starts again
 # from the stamp, as it does where time jumps.
 
-CLOCK_SIZE = 11
-"""Entries: running, time, period, P_tt, P_tT, P_TT, jitter variance, unbelieved in a row, nominal, count, and
-how many samples were last counted as missing, until a stamp is believed again."""
-
 _WANDER = 2e-6
 _JITTER_S = 5e-4
 _GATE = 5.0
@@ -308,8 +304,12 @@ _MOST_MISTRUST = 10
 
 
 def new_clock(period_s: float) -> FloatArray:
-    """A clock for a sensor that samples about every `period_s` [s]; NaN: stamps are taken as they are."""
-    clock = np.zeros(CLOCK_SIZE)
+    """A clock for a sensor that samples about every `period_s` [s]; NaN: stamps are taken as they are.
+
+    Its entries are: running, time, period, P_tt, P_tT, P_TT, jitter variance, unbelieved in a row, nominal,
+    count, and how many samples were last counted as missing, until a stamp is believed again.
+    """
+    clock = np.zeros(11)
     clock[8] = period_s
     clock[6] = _JITTER_S**2
     return clock
@@ -1130,6 +1130,3 @@ class Filter:
         here, count = int(self._memory.whole[NEWEST]), len(self._model.levels)
         x, P = self._bank.x[here, :, :SIZE], self._bank.P[here, :, :, :SIZE]
         return x.copy(), P.copy(), self._bank.weights[here, :count].copy()
-
-
-assert CLOCK_SIZE == 11

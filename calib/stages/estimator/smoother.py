@@ -78,7 +78,7 @@ class Events:
     rows: IntArray
 
 
-def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
+def events_of(setup: Setup, rows: Rows) -> Events:
     """Events of a log: pictures at their exposure, IMU samples, and the rows' own stamps.
 
     Stamps run through the clocks, which do not look ahead.
@@ -93,8 +93,8 @@ def events_of(setup: Setup, rows: Rows, outputs: bool = True) -> Events:
     pixels = np.full((len(camera), 4), np.nan)
     pixels[:, :2], pixels[:, 3] = rows.readings[camera, :2], camera_s2[seen]
     samples = np.column_stack([rows.readings[imu, 2:], imu_s2])
-    every = np.arange(len(rows)) if outputs else np.zeros(0, dtype=np.int64)
-    t = np.concatenate([exposed, taken, rows.t_s[every]])
+    every = np.arange(len(rows))
+    t = np.concatenate([exposed, taken, rows.t_s])
     kinds = np.repeat([1, 2, 0], [len(camera), len(imu), len(every)])
     readings = np.concatenate([pixels, samples, np.full((len(every), 4), np.nan)])
     order = np.argsort(t, kind="stable")
