@@ -98,8 +98,6 @@ _ACROSS = 0.3
 """How far across an edge its place is looked for, in squares."""
 _SHARP, _SHARP_AT = 0.6, 0.15
 """Least share of the step from dark to bright within so many squares of an edge: blur makes squares round."""
-_LEAST_AMPLITUDE = 2.5
-"""Grey levels."""
 _CONTINUES = 0.4
 """Least amplitude of a further corner over the median of the grid."""
 _WORST_RESIDUAL = 0.3
@@ -126,14 +124,6 @@ _SMOOTHED_PX = 12.0
 """Side of squares from which on their tones are averages over 3 x 3 pixels."""
 _FINE = 1 / 14
 """Share of a square's side below which detail counts for nothing: cells of markers are larger."""
-
-
-def _turns_alike(points: FloatArray) -> bool:
-    """Whether every square is convex and turns the same way."""
-    corners = np.stack([points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]])
-    one = np.roll(corners, -1, axis=0) - corners
-    two = np.roll(one, -1, axis=0)
-    return bool(np.all(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0] > 0))
 
 
 def _squares_are_plain(grid: Refined, close: bool) -> bool:
@@ -238,16 +228,12 @@ def fault_of(gray: GrayImage, grid: Refined) -> str | None:
     close = grid.misfit_px < _CLOSE_MISFIT * square
     if np.mean(~grid.refined) > (_CLOSE_UNREFINED_SHARE if close else _UNREFINED_SHARE):
         return "corners that are none"
-    if np.median(np.abs(grid.amplitude)) < _LEAST_AMPLITUDE:
-        return "too little contrast"
     if np.median(grid.residual) > _MEDIAN_RESIDUAL and not (close and _squares_meet(grid)):
         return "corners of another shape"
     if np.median(grid.sigma_px) > _LOOSE * square and not _squares_meet(grid):
         return "edges without corners"
     if not grid.misfit_px < _MISFIT * square:
         return "corners off the grid"
-    if not _turns_alike(grid.points):
-        return "a folded grid"
     if min(shape) >= 2 and not _squares_are_plain(grid, close):
         return "squares that are not plain"
     if min(shape) >= 2 and _edges_bulge(grid):
