@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import random
-import sys
+from functools import partial
 from pathlib import Path
 
-MODULES = ("calib.io.bags", "calib.io.bags", "calib.io.bags", "calib.io.bags")
+from fuzz.bagbytes import check_bag, damage
+
+MODULES = ("calib.io.bags",)
 
 MOST_BYTES = 12_000
 
 RULE = b"\n== topics ==\n"
 """Between the bag and topics.yaml, where there is one."""
+
+mutate = partial(damage, rule=RULE)
 
 WORDS = (
     b"\x89MCAP0\r\n", b"json", b"jsonschema", b"ros2msg", b"ros2idl", b"ros1msg", b"cdr", b"ros1", b"zstd",
@@ -23,8 +26,6 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """Rows with a time, or a refusal."""
-    from fuzz.bagbytes import check_bag
-
     body, rule, topics = data.partition(RULE)
     path, beside = folder / "log.mcap", folder / "topics.yaml"
     path.write_bytes(body)
@@ -32,16 +33,3 @@ def check(data: bytes, folder: Path) -> None:
     if rule:
         beside.write_bytes(topics)
     check_bag(path)
-
-
-def mutate(data: bytes, dice: random.Random) -> bytes:
-    """Numbers and parts of the bag or of the file beside it."""
-    from fuzz.bagbytes import damage, mutate_parts
-
-    return mutate_parts(data, RULE, dice) if RULE in data else damage(data, dice)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

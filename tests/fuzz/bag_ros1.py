@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import random
-import sys
 from pathlib import Path
 
-MODULES = ("calib.io.bags", "calib.io.bags", "calib.io.bags", "calib.io.bags")
+from fuzz.bagbytes import check_bag, damage
+
+MODULES = ("calib.io.bags",)
+
+mutate = damage
 
 MOST_BYTES = 12_000
 
@@ -19,21 +21,6 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """Rows with a time, or a refusal."""
-    from fuzz.bagbytes import check_bag
-
     path = folder / "log.bag"
     path.write_bytes(data)
     check_bag(path)
-
-
-def mutate(data: bytes, dice: random.Random) -> bytes:
-    """Numbers and parts of the bytes."""
-    from fuzz.bagbytes import damage
-
-    return damage(data, dice)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import random
 import shutil
-import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
-MODULES = ("calib.io.bags", "calib.io.bags", "calib.io.bags", "calib.io.bags")
+from fuzz.bagbytes import check_bag, damage
+
+MODULES = ("calib.io.bags",)
 
 MOST_BYTES = 40_000
 
 RULE = b"\n== bag ==\n"
 """Between metadata.yaml and the bag; a database by itself has none."""
+
+mutate = partial(damage, rule=RULE)
 
 WORDS = (
     b"rosbag2_bagfile_information:", b"version: 9", b"storage_identifier: mcap",
@@ -29,8 +32,6 @@ WORDS = (
 
 def check(data: bytes, folder: Path) -> None:
     """Rows with a time, or a refusal."""
-    from fuzz.bagbytes import check_bag
-
     metadata, rule, body = data.partition(RULE)
     if not rule:
         path = folder / "log.db3"
@@ -46,16 +47,3 @@ def check(data: bytes, folder: Path) -> None:
     # A bag that is packed as a whole is unpacked where temporary files go.
     with mock.patch.object(tempfile, "tempdir", str(folder)):
         check_bag(path)
-
-
-def mutate(data: bytes, dice: random.Random) -> bytes:
-    """Numbers and parts of the metadata or of the bag."""
-    from fuzz.bagbytes import damage, mutate_parts
-
-    return mutate_parts(data, RULE, dice) if RULE in data else damage(data, dice)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

@@ -6,13 +6,21 @@ import random
 import struct
 from pathlib import Path
 
-__all__ = ["check_bag", "damage", "mutate_parts"]
+__all__ = ["check_bag", "damage"]
 
 _SIZES = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
 
 
-def damage(data: bytes, dice: random.Random) -> bytes:
-    """A neighbour of some bytes: a number replaced, a part removed, doubled or cut off."""
+def damage(data: bytes, dice: random.Random, rule: bytes = b"") -> bytes:
+    """A neighbour of some bytes: a number replaced, a part removed, doubled or cut off.
+
+    Where they are parts with rules between them, of one of the parts.
+    """
+    if rule and rule in data:
+        parts = data.split(rule)
+        which = dice.randrange(len(parts))
+        parts[which] = damage(parts[which], dice)
+        return rule.join(parts)
     out = bytearray(data)
     for _ in range(dice.choice((1, 1, 2, 3))):
         if not out:
@@ -35,14 +43,6 @@ def damage(data: bytes, dice: random.Random) -> bytes:
             other = dice.randrange(len(out))
             out[at : at + 8] = out[other : other + 8]
     return bytes(out)
-
-
-def mutate_parts(data: bytes, rule: bytes, dice: random.Random) -> bytes:
-    """`damage` of one of the parts between rules."""
-    parts = data.split(rule)
-    which = dice.randrange(len(parts))
-    parts[which] = damage(parts[which], dice)
-    return rule.join(parts)
 
 
 def check_bag(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 MODULES = ("calib.stages.camera.read", "calib.core.bounded_yaml")
@@ -27,9 +26,3 @@ def check(data: bytes, folder: Path) -> None:
         assert 1e-5 <= board.square_m < 10
     told, _hashes = board_of([folder, folder / "other"])
     assert told == board
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

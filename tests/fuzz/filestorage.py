@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-MODULES = ("calib.stages.camera.formats", "calib.stages.camera.formats", "calib.core.bounded_yaml")
+MODULES = ("calib.stages.camera.formats", "calib.core.bounded_yaml")
 
 WORDS = (
     b"%YAML:1.0\n---\n", b"!!opencv-matrix", b"camera_matrix:", b"distortion_coefficients:", b"image_width:",
@@ -43,9 +42,3 @@ def check(data: bytes, folder: Path) -> None:
         assert np.isfinite(camera.K).all() and min(camera.image_size_px) > 0
         again = from_opencv(to_opencv(camera))
         assert np.array_equal(again.K, camera.K) and np.array_equal(again.distortion, camera.distortion)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

@@ -1,9 +1,9 @@
-"""Coverage-guided fuzzing of one reader: `python tests/fuzz/log_csv.py --seconds 600`.
+"""Coverage-guided fuzzing of one reader: `python tests/fuzz log_csv --seconds 600`.
 
-A target is a module with `check(data, folder)`, which gives the bytes to a reader and may end in no other
-way than by returning or with a `BadInputError` of one line, with `WORDS`, which the mutator puts in place
-of words of the input, and perhaps a `mutate` of its own. Needs atheris (extra `fuzz`); the replay of the
-corpus does not.
+A target is a module of this folder with `check(data, folder)`, which gives the bytes to a reader and may
+end in no other way than by returning or with a `BadInputError` of one line, with `WORDS`, which the mutator
+puts in place of words of the input, and perhaps a `mutate` of its own. Needs atheris (extra `fuzz`); the
+replay of the corpus does not.
 
     --seconds N       how long; 60 by default
     --work FOLDER     where the growing corpus and the findings go; a temporary folder by default
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import contextlib
+import importlib
 import importlib.util
 import os
 import random
@@ -325,16 +326,12 @@ def _tell_coverage(name: str, check: Check, modules: Sequence[str]) -> None:
         print(f"{name}: {module}: {len(hit)} of {len(lines)} lines in functions, {len(hit) / len(lines):.0%}")
 
 
-def _replay_finding(check: Check, path: Path) -> int:
-    print(repr(run(check, path.read_bytes(), _rooms())))
-    return 0
-
-
-def main(target: ModuleType) -> None:
-    """The command line of a target."""
-    name = Path(str(target.__file__)).stem
-    sys.path.insert(0, str(HERE.parent))
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+def main() -> None:
+    """The command line."""
+    words = argparse.ArgumentParser(
+        prog="fuzz", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    words.add_argument("target", choices=TARGETS)
     words.add_argument("input", nargs="?", type=Path)
     words.add_argument("--seconds", type=int, default=60)
     words.add_argument("--work", type=Path)
@@ -342,8 +339,10 @@ def main(target: ModuleType) -> None:
     words.add_argument("--coverage", action="store_true")
     words.add_argument("--inner", type=Path, help=argparse.SUPPRESS)
     told = words.parse_args()
+    name, target = told.target, importlib.import_module(f"fuzz.{told.target}")
     if told.input is not None:
-        sys.exit(_replay_finding(target.check, told.input))
+        print(repr(run(target.check, told.input.read_bytes(), _rooms())))
+        return
     if told.coverage:
         _tell_coverage(name, target.check, target.MODULES)
         return
@@ -357,17 +356,8 @@ def main(target: ModuleType) -> None:
     ends = time.monotonic() + told.seconds
     # A process that a fault in a library has ended is followed by another.
     while (left := int(ends - time.monotonic())) > 0:
-        again = [
-            sys.executable,
-            str(target.__file__),
-            "--inner",
-            str(room),
-            "--seconds",
-            str(left),
-            "--work",
-            str(work),
-        ]
-        code = subprocess.run(again, check=False).returncode
+        inner = ["--inner", str(room), "--seconds", str(left), "--work", str(work)]
+        code = subprocess.run([sys.executable, str(HERE), name, *inner], check=False).returncode
         if code == 0:
             break
         print(f"{name}: ended with {code}, see {work}")

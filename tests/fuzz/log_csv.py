@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import sys
 from pathlib import Path
 
 MODULES = (
@@ -97,9 +96,3 @@ def _log(data: bytes, path: Path) -> None:
                 assert same, f"line {number}: {name} is {got!r}, not {wanted!r}"
     path.write_text(log_text(log), encoding="utf-8")
     assert log_text(read_log(path)) == log_text(log)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 MODULES = ("calib.runner.fleet",)
@@ -43,9 +42,3 @@ def check(data: bytes, folder: Path) -> None:
             assert number is None or 0 <= number < 1e15
     if len(refusals) == 2:
         raise refusals[data.lstrip().startswith((b"rigs", b"options"))]
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

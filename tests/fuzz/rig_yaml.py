@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -132,9 +131,3 @@ def _formats(path: Path) -> None:
     whole.current_plane("rig.yaml")
     assert whole.camera.intrinsic_covariance is not None or whole.camera.covariance is None
     to_kalibr(camera)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import binascii
-import sys
 from pathlib import Path
 from unittest import mock
 
-MODULES = ("calib.io.serial", "calib.io.serial")
+MODULES = ("calib.io.serial",)
 
 MOST_BYTES = 1000
 
@@ -69,9 +68,3 @@ def _check(data: bytes, folder: Path) -> None:
             # A float of a board may be no number, which no log's row is.
             continue
         assert len(again) == run.ticks
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

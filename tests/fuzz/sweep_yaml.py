@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import islice
 from pathlib import Path
 
@@ -39,9 +38,3 @@ def check(data: bytes, folder: Path) -> None:
     assert bool(result.values) != bool(result.sentence)
     assert "internal error" not in result.sentence, result.sentence
     assert result.sentence.isprintable() and len(result.sentence) < 2000, repr(result.sentence)
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
-MODULES = ("calib.stages.camera.read", "calib.stages.camera.read")
+MODULES = ("calib.stages.camera.read",)
 
 WORDS = (
     b"# filename x y level", b"# filename x y weight", b"# x y filename", b"filename", b"level",
@@ -29,9 +28,3 @@ def check(data: bytes, folder: Path) -> None:
         assert 4 <= len(view.pixels) == len(view.target_m) <= 9
         assert np.isfinite(view.pixels).all() and np.isfinite(view.target_m).all()
     read_views([path], Told((3, 3), image_size_px=(640, 480)))
-
-
-if __name__ == "__main__":
-    from harness import main
-
-    main(sys.modules[__name__])
