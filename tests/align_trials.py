@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from estimatorlogs import truth_of_sensors
 
 from calib.core.arrays import FloatArray
 from calib.io.logs import Log
@@ -41,25 +42,9 @@ class Trial:
 
 def known(rig: SimulatedRig, plane_error: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trial:
     """A rig whose plane was calibrated off by shift_x, shift_y and stretch."""
-    imu, tracker, dx, dy, stretch = rig.imu, rig.tracker, *plane_error
-    truth = sensor_values(
-        {
-            "gyro_bias_radps": imu.gyro_bias_radps[2],
-            "accel_bias_x_mps2": imu.accel_bias_mps2[0],
-            "accel_bias_y_mps2": imu.accel_bias_mps2[1],
-            "mount_angle_rad": imu.mount_angle_rad,
-            "gyro_scale": imu.gyro_scale[2],
-            "imu_lever_m": imu.lever_m[1],
-            "imu_across_m": imu.lever_m[0],
-            "marker_offset_m": tracker.marker_offset_m,
-            "time_offset_s": tracker.latency_s,
-            "shift_x_m": dx,
-            "shift_y_m": dy,
-            "stretch": stretch,
-            "accel_scale_x": imu.accel_scale[0],
-            "accel_scale_y": imu.accel_scale[1],
-        }
-    )
+    dx, dy, stretch = plane_error
+    truth = truth_of_sensors(rig)
+    truth[[SENSOR.index(name) for name in ("shift_x_m", "shift_y_m", "stretch")]] = plane_error
     R, t = rig.view.R_CW.copy(), rig.view.t_CW_m
     scaled = R / np.array([1.0 + stretch, 1.0 + stretch, 1.0])
     middle = np.array(MIDDLE)

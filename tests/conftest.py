@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
-from outside import NOT_HERE, outside
+from outside import NOT_HERE, RECORDINGS, outside
 
 # As the command does before numpy is loaded: on a busy machine waiting threads make small solves 400 times
 # slower (10.4 s and 0.024 s for one slope of a drift).
@@ -105,4 +105,4 @@ def project_root() -> Path:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of real recordings; the test skips without it."""
-    return outside(Path(os.environ.get("CALIB_SHARED_DATA") or ROOT.parent / "shared" / "data"))
+    return outside(RECORDINGS)

@@ -12,7 +12,9 @@ from calib.core.arrays import FloatArray
 from calib.io.logs import Log
 from calib.stages.actuator.parameters import Creep
 from calib.stages.actuator.pump import Orifice, RateLimit
-from calib.stages.estimator.kinematic import Rows
+from calib.stages.estimator.consistency import Tally
+from calib.stages.estimator.driven import Drive, Handover, blended, smooth_both
+from calib.stages.estimator.kinematic import Rows, Setup
 from calib.stages.estimator.sensors import SIZE, accelerometer, marker, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
@@ -54,6 +56,25 @@ def driven_log(name: str, seed: int = 0, orifice: bool = False) -> tuple[Simulat
         rig = replace(rig, pump=replace(rig.pump, deflation=Orifice()))
     kind, duration = SCENARIOS[name]
     return rig, log_of(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
+
+
+def estimated(setup: Setup, drive: Drive, log: Log) -> tuple[dict[str, FloatArray], FloatArray]:
+    """Rows of `OUT` by each estimator, and the weight (n,) that the handover gives the driven model."""
+    rows = rows_from(log)
+    driven, kinematic, weight = Handover(setup, drive).run_each(rows)
+    return {
+        "kinematic": kinematic,
+        "driven": driven,
+        "handover": blended(driven, kinematic, weight),
+        "smoothed": smooth_both(setup, drive, rows, driven, kinematic),
+    }, weight
+
+
+def errors_of(setup: Setup, out: FloatArray, log: Log) -> dict[str, float]:
+    """Errors of an estimator after two seconds, as `Tally.rmse` names them."""
+    tally = Tally(setup.bellows_radius_m)
+    tally.add(out, truth(log))
+    return tally.rmse()
 
 
 def held_log(seed: int, held_s: float) -> tuple[SimulatedRig, Rows, FloatArray]:

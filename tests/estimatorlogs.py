@@ -45,6 +45,17 @@ SIGMA = {
 }
 """What a good alignment leaves unknown; of the marker, a drawing."""
 
+ALIGNED = {
+    "time_offset_s": 0.0252, "mount_angle_rad": 0.0201, "gyro_scale": 0.0055, "gyro_bias_radps": 0.0062,
+    "marker_offset_m": 0.01502, "accel_bias_mps2": [0.05, -0.041], "rest_angle_rad": 0.016,
+    "accel_scale": [0.003, -0.002], "imu_lever_m": 0.006, "plane_shift_m": [0.0, 0.0], "plane_stretch": 0.0,
+    "jitter_px": 0.3, "outlier_share": 0.003, "accel_noise_mps2": [0.0158, 0.0158],
+    "gyro_noise_radps": 0.0026, "verdict": "ok",
+    "sigma": {"time_offset_s": 5e-4, "mount_angle_rad": 3e-4, "gyro_scale": 1e-3, "gyro_bias_radps": 5e-4,
+              "marker_offset_m": 3e-5, "accel_bias_mps2": [0.02, 0.002]},
+}  # fmt: skip
+"""Section `align` of the nominal simulated rig, off within its own deviations."""
+
 NOISE = np.array([0.3, 1.0, 0.0158, 0.0158, 0.0026, 0.002, 5e-5, 5e-5, 20.0, 30.0, 25.0])
 
 

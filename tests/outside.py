@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
-__all__ = ["NOT_HERE", "outside"]
+__all__ = ["NOT_HERE", "RECORDINGS", "outside"]
+
+RECORDINGS = Path(
+    os.environ.get("CALIB_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
+)
+"""Folder of real recordings."""
 
 NOT_HERE = "not part of the project and not here"
 

@@ -7,13 +7,10 @@ OpenCV's calibrateCameraExtended, which takes ten seconds. Ratios mean something
 
 from __future__ import annotations
 
-import os
 import sys
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path[:0] = [str(Path(__file__).resolve().parent)]
-
+import _here  # noqa: F401
+import allan
 import dynamics
 import estimator
 import mahony
@@ -30,7 +27,7 @@ def main(full: bool) -> None:
     found: list[Row] = whole_process.rows()
     solved = solver.rows((20, 100, 400, 1000) if full else (20, 100, 400), full)
     found += solved
-    for job in (mahony, estimator, dynamics, monte_carlo, startup, whole_run):
+    for job in (mahony, allan, estimator, dynamics, monte_carlo, startup, whole_run):
         found += job.rows()
     print_rows(found)
     print(solver.growth(solved))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-__all__ = ["Process", "Row", "interleaved", "interleaved_processes", "peak_mib", "print_rows", "run"]
+CALIB = [sys.executable, "-c", "from calib.cli.main import main; main()"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,18 @@ class Process:
     output: str
 
 
+def fastest(
+    call: Callable[[], object], repeats: int = 5, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """Least seconds of a call: others may share the machine."""
+    times = []
+    for _ in range(repeats):
+        began = clock()
+        call()
+        times.append(clock() - began)
+    return min(times)
+
+
 def interleaved(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """Median seconds of each call, in turn: A B C A B C."""
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -64,16 +76,15 @@ def interleaved(calls: Mapping[str, Callable[[], object]], repeats: int) -> dict
     return {name: median(found) for name, found in times.items()}
 
 
-def run(command: Sequence[str]) -> Process:
-    """Carry out a command and measure it.
+def run(command: Sequence[str], folder: Path | None = None) -> Process:
+    """Carry out a command, in a folder where one is named, and measure it.
 
     The first time it compiles Python's modules, as an installer does, and keeps them.
     """
     measured = [sys.executable, "-S", str(Path(__file__).with_name("_measured.py")), *command]
     compiled = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-    return Process(
-        **json.loads(subprocess.run(measured, capture_output=True, check=True, env=compiled).stdout)
-    )
+    done = subprocess.run(measured, capture_output=True, check=True, env=compiled, cwd=folder)
+    return Process(**json.loads(done.stdout))
 
 
 def interleaved_processes(commands: Mapping[str, Sequence[str]], repeats: int) -> dict[str, Process]:

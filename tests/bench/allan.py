@@ -1,4 +1,4 @@
-"""Speed of the Allan deviation, as a script: `python tests/bench/allan.py [--repeats N]`.
+"""Speed of the Allan deviation: `python tests/bench/allan.py`.
 
 A log of ten hours at 100 Hz, in octaves, against allantools on the same readings and averaging times,
 with the largest relative difference of the two; and the whole analysis of one axis, with bounds and fit.
@@ -6,16 +6,10 @@ with the largest relative difference of the two; and the whole analysis of one a
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
-
+import _here  # noqa: F401
 import allantools
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from _rows import Row, fastest, print_rows
 
 from calib.stages.imu.allan import allan_variance, analyse, octaves
 
@@ -23,20 +17,8 @@ RATE_HZ = 100.0
 HOURS = 10.0
 
 
-def best(work: Callable[[], object], repeats: int) -> float:
-    """Least time [s]: others may share the machine."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    repeats = parser.parse_args().repeats
+def rows() -> list[Row]:
+    """One row."""
     y = np.random.default_rng(0).normal(size=round(HOURS * 3600.0 * RATE_HZ))
     m = octaves(len(y))
 
@@ -47,12 +29,10 @@ def main() -> None:
         return np.asarray(allantools.oadev(y, rate=RATE_HZ, data_type="freq", taus=m / RATE_HZ)[1])
 
     difference = float(np.abs(ours() / theirs() - 1.0).max())
-    mine, other = best(ours, repeats), best(theirs, repeats)
-    print(f"{len(y)} samples, {len(m)} averaging times; relative difference {difference:.1e}")
-    print(f"calib      {mine:.3f} s")
-    print(f"allantools {other:.3f} s, ratio {mine / other:.3f} (wanted: below 0.5)")
-    print(f"with degrees of freedom, bounds and fit {best(lambda: analyse([y], 1.0 / RATE_HZ), 1):.3f} s")
+    whole = fastest(lambda: analyse([y], 1.0 / RATE_HZ), 1)
+    note = f"{len(m)} averaging times differ by {difference:.0e}; with bounds and fit {whole:.2f} s"
+    return [Row("Allan deviation of ten hours", "allantools", fastest(ours), fastest(theirs), 2.0, note=note)]
 
 
 if __name__ == "__main__":
-    main()
+    print_rows(rows())

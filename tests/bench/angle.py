@@ -7,12 +7,8 @@ chosen on the very log with its truth. Samples are means of 60 Hz. Last come the
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import _here
 import numpy as np
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[2])]
 
 import calib
 from calib.io.logs import Log
@@ -67,4 +63,4 @@ def main(count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    main(*_here.numbers(20))

@@ -11,13 +11,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
-from pathlib import Path
 
+import _here  # noqa: F401
 import numpy as np
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
-
 from armtrials import SCALE, simulated
 
 from calib.stages.arm.identify import FULL, identify, mean_of

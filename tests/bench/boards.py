@@ -10,18 +10,14 @@ pictures that hold none.
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-ROOT = Path(__file__).resolve().parent.parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "camera")]
-
+import _here  # noqa: F401
 import cv2
 import numpy as np
+from outside import RECORDINGS
 from test_detection import (
     KINDS,
     VARIANTS,
@@ -210,8 +206,7 @@ def main() -> None:
     told = words.parse_args()
     cv2.setNumThreads(1)
     began = time.process_time()
-    data = Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data"))
-    sets = {data / name: size for name, size in SETS.items()}
+    sets = {RECORDINGS / name: size for name, size in SETS.items()}
     if told.folders:
         named = [word.split("x") for word in told.folders[1::2]]
         sets = {Path(f): (int(c), int(r)) for f, (c, r) in zip(told.folders[::2], named, strict=True)}

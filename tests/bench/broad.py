@@ -12,15 +12,9 @@ Recordings lie in the folder broad of CALIB_SHARED_DATA.
 from __future__ import annotations
 
 import argparse
-import os
-import sys
-from pathlib import Path
 
+import _here  # noqa: F401
 import numpy as np
-
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-
 from broad_trials import (
     FILES,
     PUBLISHED_DEG,
@@ -32,6 +26,7 @@ from broad_trials import (
     varied,
     windows,
 )
+from outside import RECORDINGS
 
 from calib.stages.imu.levelling import Levelling, level_three
 from calib.stages.imu.tracks import missing, planar_rate, run_peer
@@ -42,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--no-slow", action="store_true", help="leave out the peers that take seconds")
     slow = not parser.parse_known_args()[0].no_slow
-    folder = Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data")) / "broad"
+    folder = RECORDINGS / "broad"
     if not folder.is_dir():
         print(f"no recordings at {folder}; set CALIB_SHARED_DATA")
         return

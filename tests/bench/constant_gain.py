@@ -11,13 +11,7 @@ since the last tick (CALIB_RATE_IS_MEAN).
 
 from __future__ import annotations
 
-import os
-import sys
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
 from drivenlogs import driven_log
 from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
@@ -55,8 +49,7 @@ def _scored(name: str, seed: int) -> list[tuple[float, float]]:
 
 def main() -> None:
     """Print the table."""
-    first, count = (int(sys.argv[1]) if len(sys.argv) > 1 else 11), 8
-    count = int(sys.argv[2]) if len(sys.argv) > 2 else count
+    first, count = _here.numbers(11, 8)
     print("".join(f"{word:>24}" for word in ("mm, degrees", *NAMES)))
     for name in SCENARIOS:
         scores = np.mean([_scored(name, seed) for seed in range(first, first + count)], axis=0)

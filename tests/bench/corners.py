@@ -9,18 +9,15 @@ Milliseconds are of one picture on one core, refinement included.
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-ROOT = Path(__file__).resolve().parent.parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-
+import _here
 import cv2
 import numpy as np
+from outside import RECORDINGS
 from scipy.special import erf
 
 from calib.core.arrays import FloatArray, GrayImage
@@ -184,8 +181,7 @@ def _on_truth() -> None:
 def main(folders: list[str]) -> None:
     """Print the tables."""
     cv2.setNumThreads(1)
-    recordings = Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data"))
-    usual = [recordings / "opencv_left", recordings / "gloworm_qvga", ROOT / "images"]
+    usual = [RECORDINGS / "opencv_left", RECORDINGS / "gloworm_qvga", _here.ROOT / "images"]
     if folders == ["--truth"]:
         _on_truth()
         return

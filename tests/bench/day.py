@@ -12,8 +12,6 @@ rows and on all, so that what grows with the rows can be seen.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -22,10 +20,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
 import yaml
+from _rows import CALIB, run
+from estimatorlogs import ALIGNED
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
@@ -41,34 +40,19 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 BLOCK_S = 600.0
 FIRST_BLOCKS = 40
-MAIN = "from calib.cli.main import main; main()"
-ALIGN = {
-    "time_offset_s": 0.0252, "mount_angle_rad": 0.0201, "gyro_scale": 0.0055, "gyro_bias_radps": 0.0062,
-    "marker_offset_m": 0.01502, "accel_bias_mps2": [0.05, -0.041], "rest_angle_rad": 0.016,
-    "accel_scale": [0.003, -0.002], "imu_lever_m": 0.006, "plane_shift_m": [0.0, 0.0], "plane_stretch": 0.0,
-    "jitter_px": 0.3, "outlier_share": 0.003, "accel_noise_mps2": [0.0158, 0.0158],
-    "gyro_noise_radps": 0.0026, "verdict": "ok",
-    "sigma": {"time_offset_s": 5e-4, "mount_angle_rad": 3e-4, "gyro_scale": 1e-3, "gyro_bias_radps": 5e-4,
-              "marker_offset_m": 3e-5, "accel_bias_mps2": [0.02, 0.002]},
-}  # fmt: skip
-"""Of the nominal simulated rig, off within its own deviations."""
-
-
-def _calib(*words: str) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run([sys.executable, "-c", MAIN, *words], capture_output=True, check=False)
 
 
 def make_rig(path: Path) -> None:
     """rig.yaml from the shipped pictures, with an alignment."""
-    for words in (("intrinsics", str(ROOT / "images")), ("extrinsics", str(ROOT / "images" / "plane"))):
-        done = _calib(*words, "--rig", str(path))
-        if done.returncode not in (0, 1):
-            raise SystemExit(done.stderr.decode())
+    images = _here.ROOT / "images"
+    for verb, folder in (("intrinsics", images), ("extrinsics", images / "plane")):
+        done = run([*CALIB, verb, str(folder), "--rig", str(path)])
+        if done.code not in (0, 1):
+            raise SystemExit(f"{verb}: exit code {done.code}")
     document = yaml.safe_load(path.read_text())
-    path.write_text(yaml.safe_dump(document | {"align": ALIGN}))
+    path.write_text(yaml.safe_dump(document | {"align": ALIGNED}))
 
 
 def _ten_minutes(imu_only: bool, truth: bool) -> Log:
@@ -144,7 +128,7 @@ def _stages(
     rows = show("rows for the filter", n, lambda: [rows_of(block, found) for block in blocks])
     outs = show("filter", n, lambda: [estimate.run(one) for one in rows])
     tally = Tally(setup.bellows_radius_m)
-    truths = [truth_of(block) for block in blocks]
+    truths = [truth_of(block, setup) for block in blocks]
     show("consistency", n, lambda: [tally.add(o, t) for o, t in zip(outs, truths, strict=True)])
     columns = [OUT.index(name) for name in STATES]
 
@@ -167,24 +151,14 @@ def command(path: Path, rows: int, rig: Path, ending: str, model: str, folder: P
     """The command on a log of that many rows: wall and processor time, peak memory."""
     states = folder / f"states{ending}"
     words = ["replay", str(path), "--rig", str(rig), "-o", str(states), "--model", model]
-    script = (
-        "import resource, subprocess, sys, time\n"
-        "began = time.perf_counter()\n"
-        f"done = subprocess.run([sys.executable, '-c', {MAIN!r}, *sys.argv[1:]], stdout=subprocess.DEVNULL)\n"
-        "used = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
-        "print(done.returncode, time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=False)
-    if not done.stdout:
-        raise SystemExit(done.stderr)
-    code, wall, used, peak = done.stdout.split()
-    if code not in ("0", "1"):
-        raise SystemExit(done.stderr)
+    done = run([*CALIB, *words])
+    if done.code not in (0, 1):
+        raise SystemExit(f"replay: exit code {done.code}")
     into, out = path.stat().st_size / 1e6, states.stat().st_size / 1e6
     print(
-        f"  {rows:>9} rows, {into:6.0f} MB in, {out:6.0f} MB out: {float(wall):6.1f} s wall, "
-        f"{float(used):6.1f} s of processor time, {rows / float(wall) / 1e3:6.0f} thousand rows/s, "
-        f"peak {int(peak) / 1024:5.0f} MiB",
+        f"  {rows:>9} rows, {into:6.0f} MB in, {out:6.0f} MB out: {done.seconds:6.1f} s wall, "
+        f"{done.cpu_s:6.1f} s of processor time, {rows / done.seconds / 1e3:6.0f} thousand rows/s, "
+        f"peak {done.mib:5.0f} MiB",
         flush=True,
     )
 

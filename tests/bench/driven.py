@@ -10,48 +10,30 @@ ingredients buy.
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
-from drivenlogs import driven_log
-from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
+from _rows import fastest
+from drivenlogs import driven_log, errors_of, estimated
+from estimatorlogs import SCENARIOS, rows_from, setup_for
 
-from calib.core.arrays import FloatArray
-from calib.io.logs import Log
 from calib.stages.actuator.parameters import pumps_connected
-from calib.stages.estimator.consistency import Tally
-from calib.stages.estimator.driven import Drive, DrivenFilter, Handover, blended, smooth_both, smooth_driven
+from calib.stages.estimator.driven import Drive, DrivenFilter, smooth_driven
 from calib.stages.estimator.kinematic import Setup
 
 FULL = Drive()
-
-
-def _error(out: FloatArray, log: Log, setup: Setup) -> tuple[float, float, float]:
-    tally = Tally(setup.bellows_radius_m)
-    tally.add(out, truth(log))
-    found = tally.rmse()
-    return found["mean_q_mm"], found["phi_deg"], found["nees"]
+KEYS = ("mean_q_mm", "phi_deg", "nees")
 
 
 def _speed() -> None:
     rig, log = driven_log("ellipse", 1)
     setup, rows = setup_for(rig, 1), rows_from(log)
-    best, smoothed = math.inf, math.inf
-    for _ in range(4):
-        driven = DrivenFilter(setup, FULL)
-        began = time.process_time()
-        out = driven.run(rows)
-        best = min(best, time.process_time() - began)
-        began = time.process_time()
-        smooth_driven(setup, FULL, rows, out)
-        smoothed = min(smoothed, time.process_time() - began)
+    out = DrivenFilter(setup, FULL).run(rows)
+    best = fastest(lambda: DrivenFilter(setup, FULL).run(rows), 4, time.process_time)
+    smoothed = fastest(lambda: smooth_driven(setup, FULL, rows, out), 4, time.process_time)
     span = float(log.t_s[-1])
     print(f"driven filter: {best / len(rows) * 1e6:.1f} us per row, {span / best:.0f} times real time")
     print(f"its smoother: {smoothed / len(rows) * 1e6:.1f} us per row")
@@ -75,25 +57,17 @@ NO_DISTURBANCE = replace(FULL, sigma_disturbance_N=1e-6, walk_disturbance=1e-7)
 def main() -> None:
     """Print the tables."""
     _speed()
-    first = int(sys.argv[1]) if len(sys.argv) > 1 else 201
-    ablation = "short" not in sys.argv
-    seeds = range(first, first + (int(sys.argv[2]) if len(sys.argv) > 2 else 5))
+    first, count = _here.numbers(201, 5)
     print(f"{'':24s}" + "".join(f"{name:>26s}" for name in SCENARIOS))
     print(f"{'':24s}" + f"{'mm   deg  NEES':>26s}" * len(SCENARIOS))
-    table: dict[str, list[list[tuple[float, float, float]]]] = {}
+    table: dict[str, list[list[list[float]]]] = {}
     for name in SCENARIOS:
-        for seed in seeds:
+        for seed in range(first, first + count):
             rig, log = driven_log(name, seed)
             setup, rows = setup_for(rig, seed), rows_from(log)
-            driven, kinematic, weight = Handover(setup, FULL).run_each(rows)
-            outs = {
-                "kinematic": kinematic,
-                "driven": driven,
-                "with handover": blended(driven, kinematic, weight),
-                "driven, smoothed": smooth_driven(setup, FULL, rows, driven),
-                "both, smoothed": smooth_both(setup, FULL, rows, driven, kinematic),
-            }
-            if ablation:
+            outs, _ = estimated(setup, FULL, log)
+            outs["driven, smoothed"] = smooth_driven(setup, FULL, rows, outs["driven"])
+            if "short" not in sys.argv:
                 outs |= {
                     "no rounding likelihood": DrivenFilter(_without_rounding(setup), FULL).run(rows),
                     "no clock": DrivenFilter(_without_clock(setup), FULL).run(rows),
@@ -103,7 +77,7 @@ def main() -> None:
                 }
             for label, out in outs.items():
                 columns = table.setdefault(label, [[] for _ in SCENARIOS])
-                columns[list(SCENARIOS).index(name)].append(_error(out, log, setup))
+                columns[list(SCENARIOS).index(name)].append([errors_of(setup, out, log)[key] for key in KEYS])
     for label, columns in table.items():
         cells = ["{:.3f} {:.3f} {:5.1f}".format(*np.mean(column, axis=0)) for column in columns]
         print(f"{label:24s}" + "".join(f"{cell:>26s}" for cell in cells))

@@ -1,18 +1,17 @@
-"""Speed of the dynamics, as a script: `python tests/bench/dynamics.py [--repeats N]`.
+"""Speed of the dynamics: `python tests/bench/dynamics.py [swing]`; with `swing` only the last of these.
 
-Every figure is simulated time over wall time, the best of the repeats, together with the error in the
+Figures of the first two are simulated time over wall time, the best of several, with the error in the
 bellows' lengths against DOP853 at 1e-12.
 
 - one core: 1 ms steps with both pumps, random commands at every tick, the kernel and the public call;
 - batch: 200 parameter sets of 10 s on two threads;
-- against a usual implementation: the same free swing by `solve_ivp` (RK45, 1e-3, 1e-6, the settings of
-  ode45) on M, C and N that sympy derived and lambdified; over 20 s also by jsrm (`pip install jsrm`), where
-  it is installed: `--only swing` prints no more than that.
+- against a usual implementation: 20 s of free swing by `solve_ivp` (RK45, 1e-3, 1e-6, the settings of
+  ode45) on M, C and N that sympy derived and lambdified; also by jsrm (`pip install jsrm`), where it is
+  installed.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib
 import sys
@@ -23,14 +22,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import _here  # noqa: F401
 import numpy as np
 import sympy
-from scipy.integrate import solve_ivp
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[n]) for n in (2, 1, 0)]
-
-from _rows import Row, interleaved, print_rows
+from _rows import Row, fastest, interleaved, print_rows
 from open_loop import simulate, swing
+from scipy.integrate import solve_ivp
 
 from adaptive import simulate_adaptive, swing_adaptive
 from calib.core.arrays import FloatArray
@@ -44,21 +41,11 @@ PUMP = Pump(tick_s=STEPS_PER_TICK * 1e-3)
 """Ticks of 17 ms, so that the steps are exactly 1 ms."""
 
 
-def best(work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Least time [s]: others may share the machine."""
-    times = []
-    for _ in range(repeats):
-        start = clock()
-        work()
-        times.append(clock() - start)
-    return min(times)
-
-
 def commands(ticks: int, seed: int) -> FloatArray:
     return np.random.default_rng(seed).uniform(0, 255, (ticks, 2))
 
 
-def one_core(pump: Pump, repeats: int) -> tuple[float, float, float]:
+def one_core(pump: Pump) -> tuple[float, float, float]:
     """Times real time of the kernel and of `simulate`, and the largest error [m]."""
     plant, pwm = pumps_connected(), commands(600, 1)
     c, p = coefficients(plant), pump_coefficients(pump)
@@ -74,14 +61,14 @@ def one_core(pump: Pump, repeats: int) -> tuple[float, float, float]:
         simulate(plant, pump, pwm, substeps=STEPS_PER_TICK)
 
     public()
-    bare, whole = best(kernel, 20 * repeats), best(public, 20 * repeats)
+    bare, whole = fastest(kernel, 200), fastest(public, 200)
     few = pwm[:120]
     exact = simulate_adaptive(plant, pump, few, rtol=1e-12, atol=1e-14)
     error = np.abs(simulate(plant, pump, few, substeps=STEPS_PER_TICK).q_m - exact.q_m).max()
     return simulated / bare, simulated / whole, float(error)
 
 
-def batch(sets: int, threads: int, repeats: int) -> tuple[float, float]:
+def batch(sets: int, threads: int) -> tuple[float, float]:
     """Times real time, all sets together, by the wall and by the processor time of one core."""
     rng, pwm = np.random.default_rng(2), commands(589, 3)
     plants = [
@@ -94,7 +81,7 @@ def batch(sets: int, threads: int, repeats: int) -> tuple[float, float]:
 
     work()
     simulated = sets * len(pwm) * PUMP.tick_s
-    return simulated / best(work, repeats), simulated / best(work, repeats, time.process_time)
+    return simulated / fastest(work, 10), simulated / fastest(work, 10, time.process_time)
 
 
 def usual(plant: Plant) -> Callable[[float, FloatArray], FloatArray]:
@@ -128,24 +115,6 @@ def usual(plant: Plant) -> Callable[[float, FloatArray], FloatArray]:
         return np.concatenate([y[2:4], ddq, -l1 * y[4:] + l2 * y[2:4]])
 
     return slope
-
-
-def against_usual(repeats: int) -> tuple[float, float, float, float]:
-    """Times real time of the usual way and of `swing` with the whole call, and both errors [m]."""
-    plant, duration = Plant(), 4.0
-    start = state_row(plant, 0.5)
-    slope, times = usual(plant), np.linspace(0.0, duration, 401)
-
-    def ode45() -> FloatArray:
-        found = solve_ivp(slope, (0, duration), start[:6], t_eval=times, rtol=1e-3, atol=1e-6)
-        return np.asarray(found.y[:2].T)
-
-    def ours() -> FloatArray:
-        return swing(plant, start, duration, 1e-3, every=10).q_m
-
-    exact = swing_adaptive(plant, start, times, rtol=1e-12, atol=1e-14).q_m
-    errors = [float(np.abs(f() - exact).max()) for f in (ode45, ours)]
-    return duration / best(ode45, repeats), duration / best(ours, 20 * repeats), errors[0], errors[1]
 
 
 def jsrm_swings(duration: float) -> tuple[dict[str, Callable[[], object]], dict[str, str]]:
@@ -235,32 +204,21 @@ def rows(repeats: int = 5) -> list[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--only", choices=["swing"])
-    told = parser.parse_args()
-    repeats = told.repeats
-    if told.only == "swing":
-        print_rows(rows(repeats))
-        return
+    """Print what one core and two do, and the table."""
     began = time.perf_counter()
     simulate(pumps_connected(), PUMP, np.zeros((1, 2)))
     print(f"first call, compiled or loaded: {time.perf_counter() - began:.2f} s")
     for name, pump in (("rate limit", PUMP), ("orifice", replace(PUMP, deflation=Orifice()))):
-        bare, whole, error = one_core(pump, repeats)
+        bare, whole, error = one_core(pump)
         print(f"one core, 1 ms, pumps with {name}: kernel {bare:.0f}, simulate() {whole:.0f} times real time")
         print(f"    largest error {error:.1e} m (target 8000 times, 1e-6 m)")
     for threads in (1, 2):
-        wall, core = batch(200, threads, repeats)
+        wall, core = batch(200, threads)
         print(f"batch of 200 sets, {threads} threads: {wall:.0f} times real time, {core:.0f} per core in use")
     print("    target 18000 on two free cores")
-    slow, fast, rough, fine = against_usual(repeats)
-    print(f"free swing: lambdified solve_ivp RK45 {slow:.1f}, swing() {fast:.0f} times real time")
-    print(f"    {fast / slow:.0f} times as fast (target 50), errors {rough:.1e} and {fine:.1e} m")
-    print_rows(rows(repeats))
 
 
 if __name__ == "__main__":
-    main()
+    if "swing" not in sys.argv:
+        main()
+    print_rows(rows())

@@ -10,18 +10,13 @@ several, so that other work on the machine shows little.
 
 from __future__ import annotations
 
-import os
 import resource
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent), str(Path(__file__).resolve().parent)]
-
+import _here  # noqa: F401
 import numpy as np
-from _rows import Row
+from _rows import Row, fastest, print_rows
 from estimatorlogs import rows_from, setup_for, simulated
 
 from calib.stages.estimator import reference, smoother
@@ -31,12 +26,7 @@ from calib.stages.estimator.smoother import Events
 
 
 def _seconds(call: Callable[[], object], repeats: int = 7) -> float:
-    best = float("inf")
-    for _ in range(repeats):
-        began = time.process_time()
-        call()
-        best = min(best, time.process_time() - began)
-    return best
+    return fastest(call, repeats, time.process_time)
 
 
 def _growth(rows: Rows) -> None:
@@ -58,12 +48,12 @@ def _growth(rows: Rows) -> None:
     )
 
 
-def beside_filterpy() -> tuple[float, float, float]:
-    """Seconds a row of ours and of filterpy's, one level, and the largest difference in deviations."""
+def rows() -> list[Row]:
+    """One level, one row of a log."""
     rig, log = simulated("ellipse", 1)
-    rows = rows_from(log)
+    readings = rows_from(log)
     setup = setup_for(rig, 1, Kinematic(Kinematic().levels[2:3]))
-    events = smoother.events_of(setup, rows)
+    events = smoother.events_of(setup, readings)
     some = events.kinds > 0
     events = smoother.Events(*(values[some] for values in vars(events).values()))
     count = len(events.t_s)
@@ -73,7 +63,7 @@ def beside_filterpy() -> tuple[float, float, float]:
     nothing = (np.empty((1, 0, TRACE)), np.empty((0, SIZE)), np.empty((0, SIZE, SIZE)))
 
     def recursion(*kept: np.ndarray) -> None:
-        x, P, w = starting_state(setup, rows)
+        x, P, w = starting_state(setup, readings)
         smoother.forward(
             events.t_s, float(events.t_s[0]), events.kinds, events.readings, *smoother.banked(x, P, w), 0.0,
             levels[None], walk, setup.view, setup.noise, True, gated, np.empty((count, 1)), *kept,
@@ -86,45 +76,34 @@ def beside_filterpy() -> tuple[float, float, float]:
     alone()
     few = 600
     some = Events(events.t_s[:few], events.kinds[:few], events.readings[:few], events.rows[:few])
-    reference.extended(setup, rows, some, gated)
+    reference.extended(setup, readings, some, gated)
     found: list[np.ndarray] = []
-    theirs = _seconds(lambda: found.append(reference.extended(setup, rows, some, gated)[0]), 2) / few
+    theirs = _seconds(lambda: found.append(reference.extended(setup, readings, some, gated)[0]), 2) / few
     mine = _seconds(alone) / count
     difference = np.abs(found[-1] - kept_x[:few]) / np.sqrt(np.diagonal(kept_P[:few], axis1=1, axis2=2))
-    return mine, theirs, float(difference.max())
-
-
-def rows() -> list[Row]:
-    """One row."""
-    mine, theirs, difference = beside_filterpy()
-    note = f"{SIZE} states, differ by {difference:.0e} deviations"
+    note = f"{SIZE} states, differ by {difference.max():.0e} deviations"
     return [Row("estimator, one row of a log", "filterpy EKF", mine, theirs, 200.0, note=note)]
 
 
 def main() -> None:
     """Print the table."""
-    mine, theirs, difference = beside_filterpy()
-    print(
-        f"one level, {SIZE} states: {1e6 * mine:.2f} us per row, filterpy {1e6 * theirs:.0f} us: "
-        f"{theirs / mine:.0f} times as fast"
-    )
-    print(f"largest difference {difference:.1e} standard deviations")
+    print_rows(rows())
     rig, log = simulated("ellipse", 1)
-    rows = rows_from(log)
+    readings = rows_from(log)
     for label, process in (("1 level", Kinematic(Kinematic().levels[2:3])), ("4 levels", Kinematic())):
         whole = setup_for(rig, 1, process)
-        Filter(whole).run(rows)
-        seconds = _seconds(lambda whole=whole: Filter(whole).run(rows))
+        Filter(whole).run(readings)
+        seconds = _seconds(lambda whole=whole: Filter(whole).run(readings))
         print(
-            f"whole filter, {label}: {1e6 * seconds / len(rows):.2f} us per row, "
-            f"{float(rows.t_s[-1]) / seconds:.0f} times real time"
+            f"whole filter, {label}: {1e6 * seconds / len(readings):.2f} us per row, "
+            f"{float(readings.t_s[-1]) / seconds:.0f} times real time"
         )
-    _growth(rows)
-    outputs = Filter(setup_for(rig, 1)).run(rows)
+    _growth(readings)
+    outputs = Filter(setup_for(rig, 1)).run(readings)
     whole = setup_for(rig, 1)
-    smoother.smooth(whole, rows, outputs)
-    seconds = _seconds(lambda: smoother.smooth(whole, rows, outputs), 2)
-    print(f"smoother, 4 levels: {1e6 * seconds / len(rows):.1f} us per row")
+    smoother.smooth(whole, readings, outputs)
+    seconds = _seconds(lambda: smoother.smooth(whole, readings, outputs), 2)
+    print(f"smoother, 4 levels: {1e6 * seconds / len(readings):.1f} us per row")
 
 
 if __name__ == "__main__":

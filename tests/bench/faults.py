@@ -15,8 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / part) for part in ("", "firmware")]
-
+import _here
 from firmware_build import sketch
 from test_guard import FAULTS, at_many_moments, kept
 
@@ -42,5 +41,4 @@ def main(moments: int, faults: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 24
-    sys.exit(main(count, sys.argv[2:] or list(FAULTS)))
+    sys.exit(main(*_here.numbers(24), sys.argv[2:] or list(FAULTS)))

@@ -16,14 +16,13 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from fleet_processes import COMMAND, done, workers
+import _here
+from _rows import CALIB, run
+from fleet_processes import done, workers
 from fleet_rigs import write_fleet, write_manifest
 
 from calib.core.files import sha256
@@ -46,12 +45,9 @@ def _load() -> str:
 def _single(folder: Path, place: Path) -> bytes:
     """What the verbs leave that a person would type for this folder."""
     rig = place / f"{folder.name}.yaml"
-    for words in (
-        ("intrinsics", str(folder / "images"), "--model", "radial2", "--rig", str(rig)),
-        ("distortion", "--rig", str(rig)),
-    ):
-        done = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
-        assert done.returncode in (0, 1), done.stderr
+    for words in (("intrinsics", str(folder / "images"), "--model", "radial2"), ("distortion",)):
+        ended = run([*CALIB, *words, "--rig", str(rig)])
+        assert ended.code in (0, 1), words
     return rig.read_bytes()
 
 
@@ -60,7 +56,7 @@ def kill(folders: list[Path], manifest: Path, place: Path) -> None:
     out = place / "killed"
     began = time.monotonic()
     process = subprocess.Popen(
-        [*COMMAND, "fleet", str(manifest), "-o", str(out), "--workers", "2"],
+        [*CALIB, "fleet", str(manifest), "-o", str(out), "--workers", "2"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -84,25 +80,7 @@ def kill(folders: list[Path], manifest: Path, place: Path) -> None:
         (out / "rigs" / folder.name / "rig.yaml").read_bytes() == _single(folder, singles)
         for folder in folders
     )
-    print(f"  byte for byte those of single runs: {same} of {len(folders)}")
-    own = subprocess.run(
-        [
-            *COMMAND,
-            "intrinsics",
-            str(folders[0] / "images"),
-            "--model",
-            "radial2",
-            "--rig",
-            str(place / "own.yaml"),
-        ],
-        capture_output=True,
-        check=False,
-    )
-    subprocess.run(
-        [*COMMAND, "distortion", "--rig", str(place / "own.yaml")], capture_output=True, check=False
-    )
-    equal = (place / "own.yaml").read_bytes() == (out / "rigs" / folders[0].name / "rig.yaml").read_bytes()
-    print(f"  and of a process of its own (exit code {own.returncode}): {equal}", flush=True)
+    print(f"  byte for byte those of single runs: {same} of {len(folders)}", flush=True)
 
 
 def speed(folders: list[Path], manifest: Path, place: Path) -> None:
@@ -111,17 +89,10 @@ def speed(folders: list[Path], manifest: Path, place: Path) -> None:
     for turn in range(2):
         for count in (1, 2):
             out = place / f"speed-{count}-{turn}"
-            before, began = _load(), time.monotonic()
-            subprocess.run(
-                [*COMMAND, "fleet", str(manifest), "-o", str(out), "--workers", str(count)],
-                capture_output=True,
-                check=False,
-            )
-            seconds[count].append(time.monotonic() - began)
-            print(
-                f"{len(folders)} rigs, {count} worker(s): {seconds[count][-1]:7.1f} s ({before})",
-                flush=True,
-            )
+            before = _load()
+            ended = run([*CALIB, "fleet", str(manifest), "-o", str(out), "--workers", str(count)])
+            seconds[count].append(ended.seconds)
+            print(f"{len(folders)} rigs, {count} worker(s): {ended.seconds:7.1f} s ({before})", flush=True)
     one, two = min(seconds[1]), min(seconds[2])
     print(
         f"efficiency {one / (2.0 * two):.3f} (seconds of one worker over twice those of two, start included)"
@@ -161,13 +132,13 @@ def memory(place: Path) -> None:
 def whole(place: Path) -> None:
     """A folder with logs: what a fleet brings back against what `calib run` leaves."""
     root, out = place / "whole", place / "run"
-    shutil.copytree(Path(__file__).resolve().parents[2] / "images", root / "images")
+    shutil.copytree(_here.ROOT / "images", root / "images")
     (root / "logs").mkdir()
     for seed, (name, scenario, seconds) in enumerate((("static1", "static", 12.0), ("swing", "swing", 5.0))):
-        run = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
-        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(run)))
+        moved = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
+        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(moved)))
     answer = calibrate_rig(RigSpec("whole", str(root)), FleetOptions(pages=True))
-    subprocess.run([*COMMAND, "run", str(root), "-o", str(out)], capture_output=True, check=False)
+    run([*CALIB, "run", str(root), "-o", str(out)])
     told = answer.outcome
     same = [name for name, data in answer.files.items() if (out / name).read_bytes() == data]
     print(f"a rig with logs: {told.status}, {told.seconds:.0f} s, {told.peak_MB} MB")
@@ -184,7 +155,6 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", default=[], help=", ".join(PARTS))
     asked = parser.parse_args()
     parts = asked.parts or PARTS
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory(prefix="fleet-") as name:
         place = Path(name)
         if "memory" in parts:

@@ -9,14 +9,10 @@ The exit code is 1 when one broke; its seed is printed.
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
 from drivenlogs import hostile, unsound
 from estimatorlogs import SCENARIOS, rows_from, setup_for, simulated
@@ -55,5 +51,4 @@ def main(count: int, first: int) -> int:
 
 
 if __name__ == "__main__":
-    numbers = [int(one) for one in sys.argv[1:]]
-    sys.exit(main(*(numbers + [2000, 1][len(numbers) :])))
+    sys.exit(main(*_here.numbers(2000, 1)))

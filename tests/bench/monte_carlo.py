@@ -8,15 +8,9 @@ loop runs on a part of the sets, with its own threads; its time is taken for all
 
 from __future__ import annotations
 
-import os
-import sys
 import time
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent), str(HERE)]
-
+import _here  # noqa: F401
 import cv2
 import numpy as np
 from _rows import Row, print_rows

@@ -29,8 +29,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
 from firmware_build import LIMITS, NATIVE, Ticks, hostile, run, write
 from firmware_rigs import header
@@ -124,14 +123,14 @@ def _mutated(folder: Path, mutant: Mutant) -> str:
     return text
 
 
+def _gcc(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    call = ["gcc", "-std=c99", "-w", f"-I{folder}", *map(str, words)]
+    return subprocess.run(call, check=False, capture_output=True, text=True)
+
+
 def _built(folder: Path, source: Path, *flags: str) -> Path | None:
     made = folder / source.stem
-    call = ["gcc", "-std=c99", "-O0", "-w", *flags, f"-I{folder}", source, "-lm", "-o", made]
-    return (
-        made
-        if subprocess.run(list(map(str, call)), check=False, capture_output=True).returncode == 0
-        else None
-    )
+    return made if _gcc(folder, "-O0", *flags, source, "-lm", "-o", made).returncode == 0 else None
 
 
 def _caught(folders: dict[str, Path], mutant: Mutant) -> bool | None:
@@ -156,19 +155,7 @@ def _caught(folders: dict[str, Path], mutant: Mutant) -> bool | None:
 def _code(folder: Path, fused: int) -> str:
     """What an optimising compiler makes of the firmware."""
     (folder / "whole.c").write_text(UNIT)
-    call = [
-        "gcc",
-        "-std=c99",
-        "-O2",
-        "-w",
-        f"-DCALIB_FUSED={fused}",
-        f"-I{folder}",
-        "-S",
-        "-o",
-        "-",
-        folder / "whole.c",
-    ]
-    return subprocess.run(list(map(str, call)), check=False, capture_output=True, text=True).stdout
+    return _gcc(folder, "-O2", f"-DCALIB_FUSED={fused}", "-S", "-o", "-", folder / "whole.c").stdout
 
 
 def _alike(folders: dict[str, Path], plain: dict[tuple[str, int], str], mutant: Mutant) -> bool:
@@ -277,5 +264,4 @@ def main(count: int, seed: int) -> int:
 
 
 if __name__ == "__main__":
-    words = [int(word) for word in sys.argv[1:]]
-    sys.exit(main(*words, *(200, 1)[len(words) :]))
+    sys.exit(main(*_here.numbers(200, 1)))

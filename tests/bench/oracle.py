@@ -11,21 +11,16 @@ made, both as roots of means of squares.
 
 from __future__ import annotations
 
-import os
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
-from drivenlogs import driven_log
-from estimatorlogs import SCENARIOS, SIGMA, rows_from, setup_for, truth, truth_of_sensors
+from drivenlogs import driven_log, errors_of, estimated
+from estimatorlogs import SCENARIOS, SIGMA, setup_for, truth_of_sensors
 
-from calib.core.arrays import FloatArray
-from calib.stages.estimator.consistency import Tally
-from calib.stages.estimator.driven import Drive, Handover, blended, smooth_both
+from calib.stages.estimator.driven import Drive
 from calib.stages.estimator.kinematic import Setup
 from calib.stages.estimator.sensors import SENSOR, view_coefficients
 from calib.twin.rig import SimulatedRig
@@ -101,41 +96,34 @@ def variant(name: str, setup: Setup, rig: SimulatedRig) -> tuple[Setup, Drive]:
 VARIANTS = ("nothing", *SENSORS, "sensors", "plant", "no process noise", "all", "all, no process noise")
 
 
-def scores(out: FloatArray, true: FloatArray, radius_m: float) -> tuple[float, float, float, float]:
-    """Error [mm], phi [deg], NEES, and the deviations of q over its errors."""
-    tally = Tally(radius_m)
-    tally.add(out, true)
-    found = tally.rmse()
+def scores(found: Mapping[str, float]) -> tuple[float, float, float, float]:
+    """Error [mm], phi [deg], NEES, and the deviation of q that is told [mm]."""
     told = 0.5 * (found["sigma_q1_mm"] + found["sigma_q2_mm"])
     return found["mean_q_mm"], found["phi_deg"], found["nees"], told
 
 
 def main() -> None:
     """Print both tables."""
-    numbers = [int(word) for word in sys.argv[1:] if word.isdigit()]
     chosen = [word for word in sys.argv[1:] if not word.isdigit()] or list(VARIANTS)
-    first, count = (*numbers, 1, 8)[:2] if len(numbers) != 1 else (numbers[0], 8)
-    print(f"{'':6s}{'known':24s}" + "".join(f"{name:>27s}" for name in SCENARIOS))
-    print(f"{'':30s}" + f"{'mm   deg  NEES  told':>27s}" * len(SCENARIOS))
+    first, count = _here.numbers(1, 8)
+    print(f"{'':8s}{'known':24s}" + "".join(f"{name:>27s}" for name in SCENARIOS))
+    print(f"{'':32s}" + f"{'mm   deg  NEES  told':>27s}" * len(SCENARIOS))
     for name in chosen:
-        rows: dict[str, list[str]] = {"filter": [], "smooth": []}
+        rows: dict[str, list[str]] = {"handover": [], "smoothed": []}
         for scenario in SCENARIOS:
-            found: dict[str, list[tuple[float, float, float, float]]] = {"filter": [], "smooth": []}
+            found: dict[str, list[tuple[float, float, float, float]]] = {way: [] for way in rows}
             for seed in range(first, first + count):
                 rig, log = driven_log(scenario, seed)
                 setup, drive = variant(name, setup_for(rig, seed), rig)
-                readings, true = rows_from(log), truth(log)
-                driven, kinematic, weight = Handover(setup, drive).run_each(readings)
-                radius = setup.bellows_radius_m
-                found["filter"].append(scores(blended(driven, kinematic, weight), true, radius))
-                smoothed = smooth_both(setup, drive, readings, driven, kinematic)
-                found["smooth"].append(scores(smoothed, true, radius))
+                outs, _ = estimated(setup, drive, log)
+                for way, all_scores in found.items():
+                    all_scores.append(scores(errors_of(setup, outs[way], log)))
             for way, all_scores in found.items():
                 mm, degrees, nees, _ = np.mean(all_scores, axis=0)
                 square = np.mean(np.square(all_scores), axis=0)
                 rows[way].append(f"{mm:.3f} {degrees:.3f} {nees:5.1f} {np.sqrt(square[3] / square[0]):5.2f}")
         for way, cells in rows.items():
-            print(f"{way:6s}  {name:22s}" + "".join(f"{cell:>27s}" for cell in cells), flush=True)
+            print(f"{way:8s}  {name:22s}" + "".join(f"{cell:>27s}" for cell in cells), flush=True)
 
 
 if __name__ == "__main__":

@@ -6,11 +6,12 @@ The errors are RMS of the head's place in mm, with simulated sensors, after the 
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import tempfile
 from json import loads
 from pathlib import Path
+
+from _rows import CALIB, run
 
 REFERENCES, CONTROLLERS = ("ellipse", "elongation"), ("pd", "pd+ff", "pd+map", "tuned-pd", "torque")
 PLANTS = {
@@ -32,11 +33,10 @@ def main() -> None:
         folder = Path(place)
 
         def calib(*words: str) -> dict[str, object]:
-            command = [sys.executable, "-m", "calib", "control", *words, "--json"]
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-            if done.returncode > 1:
-                sys.exit(done.stderr)
-            found: dict[str, object] = loads(done.stdout)
+            done = run([*CALIB, "control", *words, "--json"], folder)
+            if done.code > 1:
+                sys.exit(f"control {' '.join(words)}: exit code {done.code}")
+            found: dict[str, object] = loads(done.output)
             return found
 
         calib("tune", "--rig", "rig.yaml")

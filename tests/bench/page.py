@@ -13,8 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
+import _here  # noqa: F401
 from chromium import browser_or_skip
 
 from calib.show.charts import library

@@ -26,22 +26,19 @@ Mass is not identified: what scales with it is compared as a share of it.
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent), str(Path(__file__).resolve().parent)]
-
+import _here  # noqa: F401
 import numpy as np
+from _rows import CALIB
 from drivenlogs import varied_drive
-from estimatorlogs import truth_of_sensors
+from estimatorlogs import SCENARIOS, truth_of_sensors
 from scipy.spatial.transform import Rotation
 from wrong_models import PLAY, RANGE_PWM, played
 
@@ -65,13 +62,6 @@ from calib.twin.simulate import log_of, simulate
 
 RESTS = ("static1", "static2")
 ALIGNED = ("swing1", "swing2", "ellipse", "orientation")
-REPLAYED = {
-    "static": ("static", 15.0),
-    "swing": ("swing", None),
-    "ellipse": ("ellipse", None),
-    "step": ("orientation", None),
-    "elongation": ("elongation", None),
-}
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "thesis": ("rig.yaml", {"estimator": "baseline"}),
     "kinematic": ("rig.yaml", {"model": "kinematic"}),
@@ -176,7 +166,7 @@ def make(folder: Path, seed: int, off_mm: float, raised: bool, wrong: str | None
             text = _log(rig, *LOGS[name], 1000 * seed + k, None, wrong == "hysteresis")
             (folder / "logs" / f"{name}.csv").write_text(text)
     (folder / "replayed").mkdir()
-    for k, (name, (kind, span)) in enumerate(REPLAYED.items()):
+    for k, (name, (kind, span)) in enumerate(SCENARIOS.items()):
         text = _log(rig, kind, {}, 100_000 + 100 * seed + k, span, wrong == "hysteresis")
         (folder / "replayed" / f"{name}.csv").write_text(text)
 
@@ -198,8 +188,9 @@ def calibrate(folder: Path, undrawn: bool, off_mm: float) -> str:
     ):
         if words[0] == "identify":
             rig = Path(shutil.copy(rig, folder / "identified.yaml"))
-        command = [sys.executable, "-c", "from calib.cli.main import main; main()", *words, "--rig", str(rig)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [*CALIB, *words, "--rig", str(rig)], capture_output=True, text=True, check=False
+        )
         (folder / f"{words[0]}.txt").write_text(done.stdout + done.stderr)
         if done.returncode > 1:
             raise SystemExit(f"{' '.join(words)}: {done.stderr}")
@@ -293,8 +284,8 @@ def coverage(rigs: list[dict[str, dict[str, tuple[float, float]]]]) -> None:
 
 def table(results: dict[str, dict[str, list[Replayed]]], count: int, wrong: str | None) -> None:
     """Errors by way and log, then NIS."""
-    print(f"\n{f'{count} rigs':21s}" + "".join(f"{name:>32s}" for name in REPLAYED))
-    print(f"{'':21s}" + f"{'mm    95 %   deg   NEES/n max':>32s}" * len(REPLAYED))
+    print(f"\n{f'{count} rigs':21s}" + "".join(f"{name:>32s}" for name in SCENARIOS))
+    print(f"{'':21s}" + f"{'mm    95 %   deg   NEES/n max':>32s}" * len(SCENARIOS))
     for way, by_log in results.items():
         print(f"{way:21s}" + "".join(f"{_line(found):>32s}" for found in by_log.values()))
         target = TARGET_WRONG if wrong else TARGET[way.partition(",")[0]]
@@ -316,7 +307,7 @@ def main() -> None:
     parser.add_argument("--raised", action="store_true")
     parser.add_argument("--wrong", choices=WRONG)
     given = parser.parse_args()
-    results: dict[str, dict[str, list[Replayed]]] = {way: {name: [] for name in REPLAYED} for way in WAYS}
+    results: dict[str, dict[str, list[Replayed]]] = {way: {name: [] for name in SCENARIOS} for way in WAYS}
     off: list[tuple[float, float]] = []
     rigs: list[dict[str, dict[str, tuple[float, float]]]] = []
     with tempfile.TemporaryDirectory() as place:
@@ -335,10 +326,10 @@ def main() -> None:
             for way, (file, how) in WAYS.items():
                 path = folder / file
                 rig = Rig.load(path)
-                for name in REPLAYED:
+                for name in SCENARIOS:
                     found = replay_log(folder / "replayed" / f"{name}.csv", rig, path, **how)
                     results[way][name].append(found)
-            each = [results["driven, identified"][name][-1].rmse for name in REPLAYED]
+            each = [results["driven, identified"][name][-1].rmse for name in SCENARIOS]
             errors = " ".join(f"{e['mean_q_mm']:.3f} ({0.5 * e['nees']:.1f})" for e in each)
             spent = time.monotonic() - began
             print(f"rig {seed} ({done}/{given.count}): {said}; driven {errors}; {spent:.0f} s", flush=True)

@@ -11,17 +11,14 @@ time is taken inside its process, once it has loaded.
 from __future__ import annotations
 
 import json
-import os
+import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from statistics import median
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parent)]
-
+import _here
 import cv2
 import numpy as np
 from _rows import Row, interleaved, peak_mib, print_rows
@@ -40,15 +37,9 @@ def _ours(views: list[View]) -> tuple[float, float]:
 
 
 def _python_with_mrcal() -> str | None:
-    for python in (sys.executable, "/usr/bin/python3"):
-        try:
-            if (
-                subprocess.run([python, "-c", "import mrcal"], capture_output=True, check=False).returncode
-                == 0
-            ):
-                return python
-        except OSError:
-            continue
+    for python in filter(None, map(shutil.which, (sys.executable, "/usr/bin/python3"))):
+        if subprocess.run([python, "-c", "import mrcal"], capture_output=True, check=False).returncode == 0:
+            return python
     return None
 
 
@@ -57,8 +48,7 @@ def _mrcal(python: str, views: list[View]) -> dict[str, float]:
         pixels = np.stack([view.pixels.reshape(BOARD.rows, BOARD.columns, 2) for view in views])
         np.savez(file, pixels=pixels, square_m=BOARD.square_m, image_size_px=(640, 480))
         file.flush()
-        script = Path(__file__).with_name("_mrcal.py")
-        call = [python, str(script), file.name]
+        call = [python, str(_here.BENCH / "_mrcal.py"), file.name]
         return json.loads(subprocess.run(call, capture_output=True, check=True, text=True).stdout)
 
 

@@ -11,15 +11,9 @@ import json
 import os
 import sys
 import tempfile
-from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
-sys.path[:0] = [str(ROOT), str(HERE)]
-
-from _rows import Row, interleaved_processes, print_rows
-
-CALIB = [sys.executable, "-c", "from calib.cli.main import main; main()"]
+import _here
+from _rows import CALIB, Row, interleaved_processes, print_rows
 
 
 def rows(repeats: int = 9) -> list[Row]:
@@ -32,7 +26,7 @@ def rows(repeats: int = 9) -> list[Row]:
             {
                 "help": [*CALIB, "--help"],
                 "python": [sys.executable, "-c", "pass"],
-                "intrinsics": [*CALIB, "intrinsics", str(ROOT / "images"), "--rig", rig, "--json"],
+                "intrinsics": [*CALIB, "intrinsics", str(_here.ROOT / "images"), "--rig", rig, "--json"],
                 "import": [sys.executable, "-c", "import cv2, numpy"],
             },
             repeats,

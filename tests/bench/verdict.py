@@ -11,15 +11,10 @@ picture, which cannot be undistorted beyond.
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections import Counter
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
 from sets import BAD, camera_of, good_set, take
 
@@ -66,4 +61,4 @@ def main(count: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
+    main(*_here.numbers(20))

@@ -8,26 +8,21 @@ Thirteen photographs of 640x480 px with 9x6 corners, where the recordings are, a
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import sys
 import tempfile
 from pathlib import Path
 
+import _here
 import cv2
 import numpy as np
-
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
-sys.path[:0] = [str(ROOT), str(HERE)]
-
-from _rows import Process, Row, interleaved_processes, print_rows
+from _rows import CALIB, Process, Row, interleaved_processes, print_rows
+from outside import RECORDINGS
 
 from calib.stages.camera.model import Board, Camera
 from calib.twin.scene import PrintedBoard, Sensor, pose_facing, render
 
-CALIB = "from calib.cli.main import main; main()"
 MRCAL = """
 set -e
 cd "$1"
@@ -38,48 +33,56 @@ awk '!/^#/ && $2 != "-" {seen[$1] = 1} END {print length(seen) " boards"}' "$3/c
 """
 
 
-def rendered(folder: Path, count: int = 13, corners: int = 10) -> None:
-    """Pictures of a board that mrgingham looks for, too."""
-    rng = np.random.default_rng(5)
+def rendered(folder: Path, count: int, size_px: tuple[int, int], board: Board, ending: str) -> None:
+    """Pictures of a board in a folder."""
+    rng, (width, height) = np.random.default_rng(5), size_px
+    lens = np.array([-0.2, 0.1, 0, 0, 0, 0, 0, 0.0])
     camera = Camera(
-        "radial2", (640, 480), 540.0, 540.0, 0.0, 322.0, 238.0, np.array([-0.2, 0.1, 0, 0, 0, 0, 0, 0.0])
+        "radial2", size_px, 0.85 * width, 0.85 * width, 0.0, 0.5 * width + 2, 0.5 * height - 2, lens
     )
-    printed = PrintedBoard(Board(corners, corners, 0.02))
+    printed = PrintedBoard(board)
     for i in range(count):
         pose = pose_facing(
             camera,
             printed,
-            (640 * rng.uniform(0.4, 0.6), 480 * rng.uniform(0.4, 0.6)),
+            (width * rng.uniform(0.4, 0.6), height * rng.uniform(0.4, 0.6)),
             rng.uniform(0.45, 0.65),
             tilt_rad=rng.uniform(0.1, 0.7),
             azimuth_rad=rng.uniform(0, 2 * np.pi),
             roll_rad=rng.uniform(-0.3, 0.3),
         )
         picture = render(camera, printed, pose, sensor=Sensor(blur_px=0.7, noise_grey=2.0), seed=i)
-        cv2.imwrite(str(folder / f"view{i:02d}.png"), picture)
+        cv2.imwrite(str(folder / f"view{i:03d}{ending}"), picture)
+
+
+def intrinsics(folder: Path, board: Board, place: str, *more: str) -> list[str]:
+    """Our command on the pictures of a folder."""
+    told = ["--corners", f"{board.columns}x{board.rows}", "--square", f"{board.square_m}m", *more]
+    return [*CALIB, "intrinsics", str(folder), *told, "--rig", f"{place}/rig.yaml"]
+
+
+def opencv_script(folder: Path, board: Board) -> list[str]:
+    """The usual script on them."""
+    told = (folder, board.columns, board.rows, board.square_m)
+    return [sys.executable, str(_here.BENCH / "_opencv_script.py"), *map(str, told)]
 
 
 def _boards(process: Process) -> str:
-    found = re.search(r"(\d+) (?:of \d+ boards|views|boards)", process.output)
-    return "no camera" if process.code or found is None else f"{found[1]} boards"
+    found = re.search(r"views +(\d+)|(\d+) (?:of \d+ )?boards", process.output)
+    return "no camera" if process.code > 1 or found is None else f"{found[1] or found[2]} boards"
 
 
-def _beside(job: str, folder: Path, columns: int, rows: int, square_m: float, repeats: int) -> list[Row]:
+def _beside(job: str, folder: Path, board: Board, repeats: int) -> list[Row]:
+    peer = "mrgingham + mrcal"
+    here = shutil.which("mrgingham") and shutil.which("mrcal-calibrate-cameras")
     with tempfile.TemporaryDirectory() as place:
-        commands: dict[str, list[str]] = {
-            "calib": [
-                sys.executable, "-c", CALIB, "intrinsics", str(folder), "--corners", f"{columns}x{rows}",
-                "--square", f"{square_m}m", "--model", "radial2", "--rig", f"{place}/rig.yaml",
-            ],
-            "OpenCV script": [
-                sys.executable, str(HERE / "_opencv_script.py"), str(folder), str(columns), str(rows),
-                str(square_m),
-            ],
-        }  # fmt: skip
-        peer = "mrgingham + mrcal"
-        here = shutil.which("mrgingham") and shutil.which("mrcal-calibrate-cameras")
-        if here and columns == rows:
-            commands[peer] = ["bash", "-c", MRCAL, "-", str(folder), str(columns), place, str(square_m)]
+        commands = {
+            "calib": intrinsics(folder, board, place, "--model", "radial2"),
+            "OpenCV script": opencv_script(folder, board),
+        }
+        if here and board.columns == board.rows:
+            told = (folder, board.columns, place, board.square_m)
+            commands[peer] = ["bash", "-c", MRCAL, "-", *map(str, told)]
         found = interleaved_processes(commands, repeats)
     ours = found.pop("calib")
     out = [
@@ -94,13 +97,14 @@ def _beside(job: str, folder: Path, columns: int, rows: int, square_m: float, re
 
 def rows(repeats: int = 5) -> list[Row]:
     """Both sets beside both peers."""
-    recordings = Path(os.environ.get("CALIB_SHARED_DATA", ROOT.parent / "shared" / "data")) / "opencv_left"
+    recordings = RECORDINGS / "opencv_left"
     out = []
     if recordings.is_dir():
-        out += _beside("corners + solve, 13 photographs 640x480", recordings, 9, 6, 0.025, repeats)
+        out += _beside("corners + solve, 13 photographs 640x480", recordings, Board(9, 6, 0.025), repeats)
     with tempfile.TemporaryDirectory() as place:
-        rendered(Path(place))
-        out += _beside("corners + solve, 13 renderings 640x480", Path(place), 10, 10, 0.02, repeats)
+        square = Board(10, 10, 0.02)
+        rendered(Path(place), 13, (640, 480), square, ".png")
+        out += _beside("corners + solve, 13 renderings 640x480", Path(place), square, repeats)
     return out
 
 

@@ -11,23 +11,17 @@ which the driven model spoke.
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import replace
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+import _here
 import numpy as np
-from drivenlogs import varied_drive
-from estimatorlogs import SCENARIOS, rows_from, setup_for, truth
+from drivenlogs import errors_of, estimated, varied_drive
+from estimatorlogs import SCENARIOS, setup_for
 
 from calib.core.arrays import FloatArray
 from calib.io.logs import Log
 from calib.stages.actuator.pump import Orifice
-from calib.stages.estimator.consistency import Tally
-from calib.stages.estimator.driven import Drive, Handover, blended, smooth_both
+from calib.stages.estimator.driven import Drive
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import at_rest, make_scenario, run_scenario
 from calib.twin.simulate import log_of, simulate
@@ -64,8 +58,7 @@ def made(kind: str, name: str, seed: int) -> tuple[SimulatedRig, Log]:
 
 def main() -> None:
     """Print the table."""
-    first = int(sys.argv[1]) if len(sys.argv) > 1 else 1
-    count = int(sys.argv[2]) if len(sys.argv) > 2 else 4
+    first, count = _here.numbers(1, 4)
     print(f"{'':24s}" + "".join(f"{name:>23s}" for name in (*ESTIMATORS, "limit share")))
     print(f"{'':24s}" + f"{'mm   deg   NEES':>23s}" * len(ESTIMATORS))
     for kind in ("as known", "orifice", "hysteresis", "quarter"):
@@ -75,17 +68,10 @@ def main() -> None:
             found, shares = [], []
             for seed in range(first, first + count):
                 rig, log = made(kind, name, seed)
-                setup, rows = setup_for(rig, seed), rows_from(log)
-                driven, kinematic, weight = Handover(setup, Drive()).run_each(rows)
-                both = blended(driven, kinematic, weight)
-                smoothed = smooth_both(setup, Drive(), rows, driven, kinematic)
-                errors = []
-                for out in (kinematic, driven, both, smoothed):
-                    tally = Tally(setup.bellows_radius_m)
-                    tally.add(out, truth(log))
-                    rmse = tally.rmse()
-                    errors.append((rmse["mean_q_mm"], rmse["phi_deg"], rmse["nees"]))
-                found.append(errors)
+                setup = setup_for(rig, seed)
+                outs, weight = estimated(setup, Drive(), log)
+                rmse = [errors_of(setup, outs[name], log) for name in ESTIMATORS]
+                found.append([[one["mean_q_mm"], one["phi_deg"], one["nees"]] for one in rmse])
                 shares.append(float((weight[log.t_s > 2.0] > 0.5).mean()))
             means = np.mean(found, axis=0)
             cells = [f"{mm:.3f} {degrees:.3f} {nees:6.1f}" for mm, degrees, nees in means]

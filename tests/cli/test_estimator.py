@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from align_trials import twin_log
-from estimatorlogs import pushed_log, simulated
+from estimatorlogs import ALIGNED, pushed_log, simulated
 
 from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
@@ -222,32 +222,7 @@ def log_file(tmp_path: Path) -> Callable[..., Path]:
 def aligned(rig: Path) -> Path:
     """A rig.yaml with a section align for the nominal simulated rig."""
     document = yaml.safe_load(rig.read_text())
-    document["align"] = {
-        "time_offset_s": 0.0252,
-        "mount_angle_rad": 0.0201,
-        "gyro_scale": 0.0055,
-        "gyro_bias_radps": 0.0062,
-        "marker_offset_m": 0.01502,
-        "accel_bias_mps2": [0.05, -0.041],
-        "rest_angle_rad": 0.016,
-        "accel_scale": [0.003, -0.002],
-        "imu_lever_m": 0.006,
-        "plane_shift_m": [0.0, 0.0],
-        "plane_stretch": 0.0,
-        "jitter_px": 0.3,
-        "outlier_share": 0.003,
-        "accel_noise_mps2": [0.0158, 0.0158],
-        "gyro_noise_radps": 0.0026,
-        "verdict": "ok",
-        "sigma": {
-            "time_offset_s": 5e-4,
-            "mount_angle_rad": 3e-4,
-            "gyro_scale": 1e-3,
-            "gyro_bias_radps": 5e-4,
-            "marker_offset_m": 3e-5,
-            "accel_bias_mps2": [0.02, 0.002],
-        },
-    }
+    document["align"] = ALIGNED
     rig.write_text(yaml.safe_dump(document))
     return rig
 
