@@ -40,6 +40,7 @@ __all__ = [
     "need",
     "pack",
     "run",
+    "selftest",
     "sketch",
     "strew",
     "warnings",
@@ -107,6 +108,17 @@ def host(folder: Path, *flags: str, compiler: str = "gcc") -> list[str]:
     strict = ["-std=c99", "-O2", "-ffp-contract=off", *warnings, *flags]
     _compile([compiler, *strict, f"-I{folder}", "-o", made, NATIVE / "program.c", "-lm"])
     return [str(made)]
+
+
+def selftest(folder: Path, which: str, *flags: str, compiler: str = "gcc") -> bool:
+    """Whether the self-test of the headers in a folder passes on this machine: "selftest" or "guard"."""
+    need(compiler)
+    made, source = folder / f"{which}-{compiler}", folder / f"{which}.c"
+    call = "calib_guard_selftest" if which == "guard" else "calib_selftest"
+    source.write_text(f'#include "calib_{which}.h"\nint main(void) {{ return {call}() != 0; }}\n')
+    language = "c++" if "++" in compiler else "c"
+    _compile([compiler, *flags, f"-I{folder}", "-x", language, source, "-lm", "-o", made])
+    return subprocess.run([made], check=False).returncode == 0
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,11 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from figure_checks import complaints
+from fleet_processes import COMMAND
 
 from calib.core.plot import Figure
 from synthetic import views_of
-
-COMMAND = (sys.executable, "-c", "from calib.cli.main import main; main()")
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,48 @@ def process(environment: dict[str, str]) -> Run:
         return Ended(done.returncode, done.stdout, done.stderr)
 
     return run
+
+
+Shell = Callable[[str, Path], subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def shell(environment: dict[str, str]) -> Shell:
+    """Runs a script of bash in a folder, in which `calib` is the command."""
+
+    def run(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        command = f'calib() {{ {shlex.join(COMMAND)} "$@"; }}\n'
+        return subprocess.run(
+            ["bash", "-c", command + script],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+
+    return run
+
+
+Start = Callable[[str], subprocess.Popen[str]]
+
+
+@pytest.fixture
+def python(environment: dict[str, str], tmp_path: Path) -> Start:
+    """Starts a script of Python as a process in the test's folder."""
+
+    def start(script: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", script],
+            cwd=tmp_path,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return start
 
 
 @pytest.fixture

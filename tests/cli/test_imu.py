@@ -14,11 +14,10 @@ import pytest
 import typer
 import yaml
 from armlogs import Arm, swung, write
-from imu_poses import AXES, G, Readings, Sensor, pose_log, sphere_poses, tilts
+from imu_poses import G, Sensor, pose_log, sphere_poses, tilts
 from outside import outside
 
 from calib.cli.verbs import verb
-from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.logs import Log, log_text, read_log, write_log
 from calib.stages import stage
@@ -142,31 +141,29 @@ def test_motion_is_poor_but_written(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert section.logs[0].moves_s == [[pytest.approx(10.0, abs=0.05), pytest.approx(12.0, abs=0.05)]]
 
 
-def test_gaps_and_repeated_rows_are_handled_and_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    t = 0.01 * np.arange(3000)
-    t[2000:] += 3600.0
-    rows = np.sort(np.concatenate([np.delete(np.arange(3000), [1000, 1001]), np.arange(100, 700, 100)]))
-    static([_write(tmp_path / "log.csv", _at_rest()[rows], t[rows])], rig=tmp_path / "rig.yaml")
-    out = capsys.readouterr().out
-    assert "2 samples missing in 1 gap, the longest 30 ms after 9.99 s" in out
-    assert "split at a gap of 3600 s after 19.99 s" in out
-    assert "6 rows (0.20%) repeat the one before; dropped" in out
-
-
-def test_units_are_refused_and_then_converted(tmp_path: Path) -> None:
-    scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
-    path = _write(tmp_path / "log.csv", _at_rest() * scale)
-    with pytest.raises(BadInputError, match="give --acc-unit g"):
-        static([path], rig=tmp_path / "rig.yaml")
-    with pytest.raises(BadInputError, match="give --gyro-unit deg/s"):
-        static([path], acc_unit="g", rig=tmp_path / "rig.yaml")
-    assert not (tmp_path / "rig.yaml").exists()
-    static([path], acc_unit="g", gyro_unit="deg/s", rig=tmp_path / "rig.yaml")
-    section = Rig.load(tmp_path / "rig.yaml").imu
-    assert section is not None
-    assert section.gyro_bias_radps[2] == pytest.approx(0.006, abs=2e-4)
+@pytest.mark.parametrize("verb_", ["static", "intrinsics", "drift", "tune"])
+def test_units_are_refused_and_then_converted(calib: Run, tmp_path: Path, verb_: str) -> None:
+    """And the answer is that of the same log in SI units."""
+    values = pose_log(sphere_poses(24), Sensor()).values if verb_ == "intrinsics" else _at_rest()
+    if verb_ == "tune":
+        arm = swung(0)
+        values[:, 2:5] = np.stack([arm.gz, arm.ax, arm.ay], axis=1)
+    in_units = values * ([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
+    log, rig = _write(tmp_path / "log.csv", in_units), tmp_path / "rig.yaml"
+    words = ("imu", verb_, log, "--rig", rig, "--json", *(["--no-peers"] if verb_ == "drift" else []))
+    ended = calib(*words)
+    assert ended.code == 3 and "so it is in g" in ended.sentence and "give --acc-unit g" in ended.sentence
+    ended = calib(*words, "--acc-unit", "g")
+    assert ended.code == 3 and "give --gyro-unit deg/s" in ended.sentence
+    assert not rig.exists()
+    converted = calib(*words, "--acc-unit", "g", "--gyro-unit", "deg/s")
+    _write(log, values)
+    numbers, wanted = (
+        [float(word) for word in re.findall(r"-?\d+\.\d+(?:e[-+]\d+)?", out)]
+        for out in (converted.out, calib(*words).out)
+    )
+    assert converted.code == 0 and len(numbers) > 20
+    assert numbers == pytest.approx(wanted, rel=1e-3, abs=1e-9)
 
 
 @pytest.mark.parametrize("verb_", ["static", "intrinsics", "drift"])
@@ -211,57 +208,17 @@ def test_a_recording_of_a_real_sensor(shared_data: Path, tmp_path: Path) -> None
     assert section.rate_hz == pytest.approx(100.0, rel=1e-3)
 
 
-HEAD_IMU_INTRINSICS = (
-    "t_s," + ",".join(f"{axis}_{'radps' if axis[0] == 'g' else 'mps2'}" for axis in AXES) + "\n"
-)
-
-
-def _write_imu_intrinsics(path: Path, log: Readings) -> Path:
-    rows = np.column_stack([log.t_s, log.values]).tolist()
-    path.write_text(
-        HEAD_IMU_INTRINSICS + "".join(",".join(f"{cell:.9g}" for cell in row) + "\n" for row in rows)
-    )
-    return path
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _write_imu_intrinsics(
-        tmp_path_factory.mktemp("poses") / "poses.csv", pose_log(sphere_poses(24), Sensor())
-    )
-
-
 def test_a_plane_with_its_short_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    good = _write_imu_intrinsics(
-        tmp_path / "good.csv", pose_log(tilts(np.radians(np.arange(0, 720, 45))), Sensor())
-    )
+    good = _write(tmp_path / "good.csv", pose_log(tilts(np.radians(np.arange(0, 720, 45))), Sensor()).values)
     intrinsics(good, gravity=G, planar=True, rig=tmp_path / "rig.yaml")
     section = Rig.load(tmp_path / "rig.yaml").imu_intrinsics
     assert section is not None
     assert section.planar
     assert section.accel.scale[:2] == pytest.approx([1.012, 0.991], abs=5e-4)
-    arc = _write_imu_intrinsics(
-        tmp_path / "arc.csv", pose_log(tilts(np.radians([-30, 0, 30, -20, 20])), Sensor())
-    )
+    arc = _write(tmp_path / "arc.csv", pose_log(tilts(np.radians([-30, 0, 30, -20, 20])), Sensor()).values)
     with pytest.raises(typer.Exit):
         intrinsics(arc, gravity=G, planar=True, rig=tmp_path / "rig.yaml")
     assert "tilt about z by 45 degrees at a time" in capsys.readouterr().out
-
-
-def test_units_are_refused_and_then_converted_in_imu_intrinsics(tmp_path: Path) -> None:
-    log = pose_log(sphere_poses(24), Sensor())
-    scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
-    path = _write_imu_intrinsics(tmp_path / "log.csv", Readings("log", AXES, log.t_s, log.values * scale))
-    rig = tmp_path / "rig.yaml"
-    with pytest.raises(BadInputError, match="give --acc-unit g"):
-        intrinsics(path, rig=rig)
-    with pytest.raises(BadInputError, match="give --gyro-unit deg/s"):
-        intrinsics(path, acc_unit="g", rig=rig)
-    assert not rig.exists()
-    intrinsics(path, gravity=G, acc_unit="g", gyro_unit="deg/s", rig=rig)
-    section = Rig.load(rig).imu_intrinsics
-    assert section is not None
-    assert section.accel.scale == pytest.approx([1.012, 0.991, 1.006], abs=3e-4)
 
 
 def test_the_recording_of_imu_tk_with_figures(
@@ -289,21 +246,15 @@ def test_the_recording_of_imu_tk_with_figures(
 
 
 @pytest.fixture(scope="module")
-def logs_imu_drift(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Two logs at rest and one in motion of the simulated rig."""
-    folder = tmp_path_factory.mktemp("logs")
-    out = {}
-    for name, scenario, seed in (("a", "static", 0), ("b", "static", 1), ("moves", "chirp", 0)):
-        run = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", 20.0)
-        out[name] = folder / f"{name}.csv"
-        out[name].write_text(log_text(log_of(run)))
-    return out
+def moves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of the simulated rig in motion."""
+    path = tmp_path_factory.mktemp("moves") / "moves.csv"
+    path.write_text(log_text(log_of(run_scenario(make_scenario("chirp"), SimulatedRig(), 0, "truth", 20.0))))
+    return path
 
 
-def test_filters_of_others_run_on_the_same_log(
-    calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path
-) -> None:
-    ended = calib("imu", "drift", logs_imu_drift["moves"], "--json", "--rig", tmp_path / "rig.yaml")
+def test_filters_of_others_run_on_the_same_log(calib: Run, moves: Path, tmp_path: Path) -> None:
+    ended = calib("imu", "drift", moves, "--json", "--rig", tmp_path / "rig.yaml")
     methods = json.loads(ended.out)["drift"]["logs"][0]["methods"]
     skipped = json.loads(ended.out)["drift"]["logs"][0]["skipped"]
     for name in ("Mahony", "Madgwick", "imufusion", "VQF"):
@@ -315,30 +266,28 @@ def test_filters_of_others_run_on_the_same_log(
 
 
 @pytest.mark.slow
-def test_figures_are_drawn_in_imu_drift(calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path) -> None:
-    words = ("imu", "drift", *logs_imu_drift.values(), "--no-peers", "--rig", tmp_path / "rig.yaml")
+def test_figures_are_drawn_in_imu_drift(calib: Run, logs: list[Path], moves: Path, tmp_path: Path) -> None:
+    words = ("imu", "drift", *logs[:2], moves, "--no-peers", "--rig", tmp_path / "rig.yaml")
     assert calib(*words, "--figures", tmp_path / "figures").code == 0
     found = sorted(path.name for path in (tmp_path / "figures").iterdir())
     assert found == ["drift_angles.png", "drift_motion_3.png", "drift_slopes.png"]
 
 
 def test_a_log_that_never_rests_and_has_no_truth_is_drawn(
-    calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path
+    calib: Run, logs: list[Path], moves: Path, tmp_path: Path
 ) -> None:
     """It shows no slope, as logs of real rigs in motion do."""
-    log = read_log(logs_imu_drift["moves"])
+    log = read_log(moves)
     bare = replace(log, columns={n: v for n, v in log.columns.items() if not n.startswith("true_")})
     write_log(tmp_path / "log.csv", bare)
-    both = logs_imu_drift["a"], tmp_path / "log.csv"
+    both = logs[0], tmp_path / "log.csv"
     words = ("imu", "drift", *both, "--no-peers", "--rig", tmp_path / "rig.yaml")
     assert calib(*words, "--figures", tmp_path / "figures").code == 0
     assert (tmp_path / "figures" / "drift_slopes.png").exists()
 
 
-def test_a_gyroscope_that_sticks_is_no_ok(
-    calib: Run, logs_imu_drift: dict[str, Path], tmp_path: Path
-) -> None:
-    head, *rows = logs_imu_drift["moves"].read_text().splitlines()
+def test_a_gyroscope_that_sticks_is_no_ok(calib: Run, moves: Path, tmp_path: Path) -> None:
+    head, *rows = moves.read_text().splitlines()
     gz = head.split(",").index("gz_radps")
     for row, line in enumerate(rows):
         cells = line.split(",")
@@ -355,22 +304,25 @@ def test_a_gyroscope_that_sticks_is_no_ok(
     )
 
 
-def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("verb_", ["static", "drift"])
+def test_repeats_and_gaps_are_handled_and_reported(calib: Run, tmp_path: Path, verb_: str) -> None:
     t = 0.01 * np.arange(3000)
     t[2000:] += 3600.0
     rows = np.sort(np.concatenate([np.delete(np.arange(3000), [1000]), np.arange(100, 700, 100)]))
     values = _at_rest()[rows]
-    values[:, 0] = 0.002
+    if verb_ == "drift":
+        values[:, 0] = 0.002
     log = _write(tmp_path / "log.csv", values, t[rows])
-    ended = calib("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
-    assert ended.code == 0
-    assert "(remark) log.csv: gx_radps never changes, it is stuck at 0.002; left out" in ended.out
+    ended = calib("imu", verb_, log, "--rig", tmp_path / "rig.yaml", *(["--no-peers"] * (verb_ == "drift")))
     assert "1 sample missing in 1 gap, the longest 20 ms after 9.99 s" in ended.out
     assert "split at a gap of 3600 s after 19.99 s" in ended.out
     assert "6 rows (0.20%) repeat the one before; dropped" in ended.out
-    # The gyroscope alone is begun anew after the hour.
-    line = next(line for line in ended.out.splitlines() if "gyroscope alone" in line)
-    assert float(line.split()[3]) == pytest.approx(-0.34, abs=0.03)
+    assert ended.code == 0
+    if verb_ == "drift":
+        assert "(remark) log.csv: gx_radps never changes, it is stuck at 0.002; left out" in ended.out
+        # The gyroscope alone is begun anew after the hour.
+        line = next(line for line in ended.out.splitlines() if "gyroscope alone" in line)
+        assert float(line.split()[3]) == pytest.approx(-0.34, abs=0.03)
 
 
 def test_a_recorder_that_writes_each_row_twice_loses_none(calib: Run, tmp_path: Path) -> None:
@@ -395,24 +347,6 @@ def test_half_of_the_samples_missing_is_poor_as_a_tenth_is(calib: Run, tmp_path:
     uneven = np.sort(np.random.default_rng(3).uniform(0.0, 30.0, 3000))
     log = _write(tmp_path / "uneven.csv", _at_rest(), uneven)
     assert "samples are missing" not in calib("imu", "static", log, "--rig", tmp_path / "rig.yaml").out
-
-
-def test_units_are_named_and_converted(calib: Run, tmp_path: Path) -> None:
-    scale = np.array([180.0 / np.pi] * 3 + [1.0 / 9.80665] * 3)
-    log = _write(tmp_path / "log.csv", _at_rest() * scale)
-    words = ("imu", "drift", log, "--no-peers", "--rig", tmp_path / "rig.yaml")
-    ended = calib(*words)
-    assert (ended.code, "so it is in g" in ended.sentence) == (3, True)
-    assert "give --acc-unit g" in ended.sentence
-    ended = calib(*words, "--acc-unit", "g")
-    assert ended.code == 3
-    assert "give --gyro-unit deg/s" in ended.sentence
-    ended = calib(*words, "--acc-unit", "g", "--gyro-unit", "deg/s", "--json")
-    slope = json.loads(ended.out)["drift"]["logs"][0]["methods"]["gyroscope alone"]["slope_degps"]
-    assert slope == pytest.approx(-np.degrees(0.006), abs=0.02)
-
-
-_STUCK = HEAD + "".join(f"{i / 100},0,0,{i % 7 / 1000},9.8,0.2,{i % 5 / 10}\n" for i in range(500))
 
 
 def test_without_a_reference_and_with_figures(calib: Run, tmp_path: Path) -> None:
@@ -464,22 +398,6 @@ def test_what_is_no_log_of_an_imu(calib: Run, tmp_path: Path, text: str, words: 
     path = tmp_path / "log.csv"
     path.write_text(text)
     assert words in _refused(calib, path)
-
-
-def test_units_are_refused_and_then_converted_in_imu_tune(calib: Run, arm: Arm, tmp_path: Path) -> None:
-    scaled = replace(arm, ax=arm.ax / 9.80665, ay=arm.ay / 9.80665, gz=np.degrees(arm.gz))
-    path = write(tmp_path / "log.csv", scaled)
-    assert "give --acc-unit g" in _refused(calib, path)
-    assert "give --gyro-unit deg/s" in _refused(calib, path, "--acc-unit", "g")
-    rig = tmp_path / "converted.yaml"
-    units = ("--acc-unit", "g", "--gyro-unit", "deg/s")
-    assert calib("imu", "tune", path, "--rig", rig, *units).code == 0
-    plain = tmp_path / "plain.yaml"
-    assert calib("imu", "tune", write(tmp_path / "si.csv", arm), "--rig", plain).code == 0
-    one, other = Rig.load(rig).orientation_filter, Rig.load(plain).orientation_filter
-    assert one is not None
-    assert other is not None
-    assert one.Kp_per_s == pytest.approx(other.Kp_per_s, rel=1e-3)
 
 
 def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from fleet_processes import COMMAND
 
 from calib.cli.diff import diff
 from calib.cli.doctor import doctor
@@ -125,50 +126,37 @@ def test_narration_goes_to_stderr_without_colour(process, pictures, tmp_path) ->
     assert [line.split()[0] for line in ended.err.splitlines()] == ["the", "found", "board", "camera"]
 
 
-def _sh(environment: dict[str, str], script: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    command = f"{sys.executable} -c 'from calib.cli.main import main; main()'"
-    return subprocess.run(
-        ["bash", "-c", script.replace("calib ", command + " ")],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-
-
-def test_a_reader_that_goes_away(environment, rig) -> None:
+def test_a_reader_that_goes_away(shell, rig) -> None:
     script = "calib export ros --rig rig.yaml | true; echo ${PIPESTATUS[0]}"
-    done = _sh(environment, script, rig.parent)
+    done = shell(script, rig.parent)
     assert done.stdout == "141\n"
     assert done.stderr == ""
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_stdout_that_is_full(environment, rig) -> None:
-    done = _sh(environment, "calib export ros --rig rig.yaml > /dev/full", rig.parent)
+def test_stdout_that_is_full(shell, rig) -> None:
+    done = shell("calib export ros --rig rig.yaml > /dev/full", rig.parent)
     assert done.returncode == 3
     assert done.stderr == "calib: standard output: cannot be written: No space left on device\n"
-    done = _sh(environment, "calib board -o /dev/full", rig.parent)
+    done = shell("calib board -o /dev/full", rig.parent)
     assert done.returncode == 3
     assert done.stderr == "calib: /dev/full: cannot be written: No space left on device\n"
 
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-", "2>/dev/full"])
-def test_streams_that_are_closed_harm_nothing(environment, rig, closed: str) -> None:
+def test_streams_that_are_closed_harm_nothing(shell, rig, closed: str) -> None:
     before = rig.read_bytes()
-    done = _sh(environment, f"calib firmware --rig rig.yaml -o out {closed}", rig.parent)
+    done = shell(f"calib firmware --rig rig.yaml -o out {closed}", rig.parent)
     assert done.returncode == 0
     assert (rig.parent / "out" / "calib_constants.h").read_text().startswith("/*\n * calib_constants.h")
     assert rig.read_bytes() == before
 
 
-def test_devices_are_written_through_and_stay(environment, rig) -> None:
-    done = _sh(environment, "calib export ros --rig rig.yaml -o /dev/stdout | head -1", rig.parent)
+def test_devices_are_written_through_and_stay(shell, rig) -> None:
+    done = shell("calib export ros --rig rig.yaml -o /dev/stdout | head -1", rig.parent)
     assert done.stdout == "image_width: 316\n"
-    assert _sh(environment, "calib board -o /dev/null", rig.parent).returncode == 0
+    assert shell("calib board -o /dev/null", rig.parent).returncode == 0
     assert Path("/dev/null").is_char_device()
 
 
@@ -179,9 +167,8 @@ def test_an_interruption_leaves_the_old_file_or_the_new_one(
     environment, project_root, rig, how, after_s
 ) -> None:
     before = rig.read_bytes()
-    command = [sys.executable, "-c", "from calib.cli.main import main; main()", "intrinsics"]
     started = subprocess.Popen(
-        [*command, str(project_root / "images"), "--rig", str(rig)],
+        [*COMMAND, "intrinsics", str(project_root / "images"), "--rig", str(rig)],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -201,7 +188,7 @@ def test_an_interruption_leaves_the_old_file_or_the_new_one(
     assert [path.name for path in rig.parent.iterdir()] == ["rig.yaml"]
 
 
-def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> None:
+def test_an_interruption_while_boards_are_searched(python, tmp_path) -> None:
     # The search sleeps in its threads; nothing may wait for them.
     script = (
         "import sys, time, numpy as np, calib.stages.camera.read\n"
@@ -217,14 +204,7 @@ def test_an_interruption_while_boards_are_searched(environment, tmp_path) -> Non
     for name in ("a.png", "b.png", "c.png"):
         (tmp_path / name).write_bytes(b"x")
     began = time.monotonic()
-    started = subprocess.Popen(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    started = python(script)
     assert started.stdout is not None
     assert started.stdout.readline().startswith("searching")
     started.send_signal(signal.SIGINT)
@@ -261,21 +241,14 @@ time.sleep(20)
 
 @pytest.mark.parametrize("body", [_LOST, _COMPILED, _SWALLOWED], ids=["callback", "compiled", "swallowed"])
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs POSIX signals")
-def test_an_interruption_is_answered_within_two_seconds(environment, tmp_path, body) -> None:
+def test_an_interruption_is_answered_within_two_seconds(python, body) -> None:
     script = (
         f"import sys, time\nimport calib.cli.main as cli\n"
         f"def run(*_):\n    exec({body!r}, {{'time': time}})\n"
         "import calib.cli.app as verbs\nverbs.command_line = lambda _: lambda **_: run()\n"
         "sys.argv = ['calib', 'doctor']\ncli.main()\n"
     )
-    started = subprocess.Popen(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    started = python(script)
     assert started.stdout is not None
     assert started.stdout.readline().startswith("in a")
     began = time.monotonic()
@@ -287,7 +260,7 @@ def test_an_interruption_is_answered_within_two_seconds(environment, tmp_path, b
 
 
 @pytest.mark.slow
-def test_the_same_inputs_give_the_same_bytes(environment, project_root, tmp_path) -> None:
+def test_the_same_inputs_give_the_same_bytes(shell, project_root, tmp_path) -> None:
     images = project_root / "images"
     runs = {"a": "", "b": "", "c": "OPENBLAS_NUM_THREADS=4 PYTHONHASHSEED=7 "}
     if (
@@ -307,7 +280,7 @@ def test_the_same_inputs_give_the_same_bytes(environment, project_root, tmp_path
                 "firmware -o .",
             )
         )
-        done = _sh(environment, script + "true", folder)
+        done = shell(script + "true", folder)
         assert done.returncode == 0, done.stderr
     for file in ("rig.yaml", "calib_constants.h"):
         first, *others = ((tmp_path / name / file).read_bytes() for name in runs)
@@ -323,7 +296,7 @@ def test_completion(environment) -> None:
         "_CALIB_COMPLETE": "complete_bash",
     }
     done = subprocess.run(
-        [sys.executable, "-c", "from calib.cli.main import main; main()"],
+        COMMAND,
         env=environment | words,
         capture_output=True,
         text=True,

@@ -7,7 +7,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -147,28 +146,21 @@ def test_a_sketch_that_was_changed_stays(calib, place: Path) -> None:
     assert sketch.read_text() == mine
 
 
-def test_states_go_through_pipes(calib, environment, place: Path) -> None:
+def test_states_go_through_pipes(calib, shell, place: Path) -> None:
     """Alone on stdout, so that another program can read them; words go to stderr."""
     assert calib("replay", "in.csv", "-o", "states.csv", cwd=place).code in (0, 1)
-    command = f"{sys.executable} -c 'from calib.cli.main import main; main()' replay in.csv"
     wanted = (place / "states.csv").read_text()
-    done = subprocess.run(
-        ["bash", "-c", f"mkfifo pipe; (cat pipe) & {command} -o pipe >&2; wait"],
-        cwd=place, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    done = shell("mkfifo pipe; (cat pipe) & calib replay in.csv -o pipe >&2; wait", place)
     assert done.stdout == wanted
     assert "verdict" in done.stderr
-    done = subprocess.run(
-        ["bash", "-o", "pipefail", "-c", f"{command} -o - | head -1"],
-        cwd=place, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
+    done = shell("set -o pipefail; calib replay in.csv -o - | head -1", place)
     assert (done.returncode, done.stdout) == (141, wanted.split("\n", 1)[0] + "\n")
 
 
 @pytest.mark.few(2, 3)
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("how", ["SIGTERM", "SIGHUP", "SIGINT", "SIGKILL"])
-def test_a_write_that_is_ended_leaves_nothing(environment, tmp_path: Path, how: str) -> None:
+def test_a_write_that_is_ended_leaves_nothing(python, tmp_path: Path, how: str) -> None:
     """A killed process leaves what the next write into the folder removes; one at work keeps its own."""
     script = (
         "import signal, sys, time\n"
@@ -185,10 +177,7 @@ def test_a_write_that_is_ended_leaves_nothing(environment, tmp_path: Path, how: 
     (tmp_path / "log.csv").write_text("t_s,u_px,v_px\n0,7,7\n")
 
     def begun() -> subprocess.Popen[str]:
-        started = subprocess.Popen(
-            [sys.executable, "-c", script], cwd=tmp_path, env=environment, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        started = python(script)
         assert started.stdout is not None
         assert started.stdout.readline() == "writing\n"
         return started

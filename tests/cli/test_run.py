@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from fleet_processes import COMMAND
 
 from calib.cli.run import run
 from calib.core.errors import BadInputError
@@ -24,25 +25,20 @@ from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
 
 
-def _log(path: Path, scenario: str, seconds: float, seed: int) -> None:
-    made = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
-    path.write_text(log_text(log_of(made)))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Path:
     """The shipped pictures with a log at rest and one in motion."""
     root = tmp_path_factory.mktemp("rig")
     shutil.copytree(project_root / "images", root / "images")
     (root / "logs").mkdir()
-    _log(root / "logs" / "static1.csv", "static", 12.0, 0)
-    _log(root / "logs" / "swing.csv", "swing", 5.0, 1)
+    for seed, (name, scenario, seconds) in enumerate((("static1", "static", 12.0), ("swing", "swing", 8.0))):
+        made = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
+        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(made)))
     return root
 
 
 def _words(folder: Path, out: Path, *more: str) -> list[str]:
-    start = "from calib.cli.main import main; main()"
-    return [sys.executable, "-c", start, "run", str(folder), "-o", str(out), *more]
+    return [*COMMAND, "run", str(folder), "-o", str(out), *more]
 
 
 def _public(out: Path) -> dict[str, bytes]:
@@ -135,18 +131,6 @@ WAYS: dict[str, tuple[int, int, str, str]] = {
     "two": (2, 2, "2", "12345"),
 }
 """Processors, stages at a time, threads asked of every library, hash seed."""
-LOGS = (("static1", "static", 12.0, 0), ("swing", "swing", 8.0, 1))
-
-
-@pytest.fixture(scope="module")
-def folder_determinism(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Path:
-    root = tmp_path_factory.mktemp("rig")
-    shutil.copytree(project_root / "images", root / "images")
-    (root / "logs").mkdir()
-    for name, scenario, seconds, seed in LOGS:
-        made = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
-        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(made)))
-    return root
 
 
 def _on(processors: int) -> Callable[[], None]:
@@ -154,14 +138,13 @@ def _on(processors: int) -> Callable[[], None]:
     return lambda: os.sched_setaffinity(0, free)
 
 
-def _run(folder_determinism: Path, out: Path, way: str) -> dict[str, bytes]:
+def _run(folder: Path, out: Path, way: str) -> dict[str, bytes]:
     """All that a run leaves, results of stages included."""
     processors, jobs, threads, seed = WAYS[way]
     names = ("OPENBLAS", "OMP", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR")
     environment = {**os.environ, **{f"{name}_NUM_THREADS": threads for name in names}, "PYTHONHASHSEED": seed}
-    words = ["run", str(folder_determinism), "-o", str(out), "--jobs", str(jobs)]
     ended = subprocess.run(
-        [sys.executable, "-c", "from calib.cli.main import main; main()", *words],
+        _words(folder, out, "--jobs", str(jobs)),
         env=environment, capture_output=True, text=True, check=False, preexec_fn=_on(processors),
     )  # fmt: skip
     assert ended.returncode in (0, 1), ended.stderr
@@ -174,12 +157,12 @@ def _run(folder_determinism: Path, out: Path, way: str) -> dict[str, bytes]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="processors are given to a process on Linux only")
-def test_any_number_of_threads_gives_the_same_bytes(folder_determinism: Path, tmp_path: Path) -> None:
-    wanted = _run(folder_determinism, tmp_path / "one", "one")
+def test_any_number_of_threads_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    wanted = _run(folder, tmp_path / "one", "one")
     assert {"rig.yaml", "report.html", "firmware/calib_constants.h", "states/swing.csv"} <= set(wanted)
     # The same folder under another name, with other times.
     again = tmp_path / "a copy"
-    shutil.copytree(folder_determinism, again, copy_function=shutil.copyfile)
+    shutil.copytree(folder, again, copy_function=shutil.copyfile)
     found = _run(again, tmp_path / "two", "two")
     assert set(found) == set(wanted)
     assert [name for name in wanted if found[name] != wanted[name]] == []

@@ -24,7 +24,6 @@ from calib.stages.actuator.parameters import Stiffness
 from calib.stages.actuator.pump import ElongationForce
 from calib.stages.align.section import LogCheck
 from calib.stages.camera.model import project, undistort
-from calib.stages.control.laws import Channel, Pid
 from calib.stages.estimator.constant_gain import design, tick_noise
 from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
@@ -322,31 +321,6 @@ def test_the_horizon_lies_beyond_the_workspace() -> None:
     ):
         assert 0.0 < least < 0.2 * _mapped(H, points)[1].min()
     assert len(world)
-
-
-def _summed(c: dict[str, float], errors: np.ndarray, clamping: bool) -> np.ndarray:
-    KPDI, KD, half = (c[f"CALIB_ORIENTATION_{n}_PWM_PER_RAD"] for n in ("KPDI", "KD_PER_DT", "KI_HALF_DT"))
-    P = e1 = 0.0
-    out = []
-    for e in errors:
-        u = KPDI * e + (P - KD * e1)
-        if clamping and not 0.0 <= u <= 255.0:
-            u, P = u - half * (e + e1), P + half * (e - e1)
-        else:
-            P += 2.0 * half * e
-        e1 = e
-        out.append(u)
-    return np.array(out)
-
-
-@pytest.mark.parametrize("clamping", [False, True])
-def test_the_pipelines_form_is_the_librarys(clamping: bool) -> None:
-    """Random errors that cross both limits, against `calib.stages.control.laws`."""
-    errors = 0.15 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.3, 400))
-    channel = Channel(Pid(1000.0, 1000.0, 10.0, clamping=clamping))
-    wanted = [channel.step(e) for e in errors.tolist()]
-    found = _summed(header().values, errors, clamping)
-    assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max() + 1e-3
 
 
 def test_the_nominal_table_holds_the_lengths_of_the_pump() -> None:

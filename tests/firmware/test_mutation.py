@@ -68,12 +68,11 @@ def _coherent(c: dict[str, float]) -> bool:
     ok = []
     fx, fy, skew = c["CALIB_CAMERA_FX_PX"], c["CALIB_CAMERA_FY_PX"], c["CALIB_CAMERA_SKEW_PX"]
     K = np.array([[fx, skew, c["CALIB_CAMERA_CX_PX"]], [0, fy, c["CALIB_CAMERA_CY_PX"]], [0, 0, 1]])
-    inverse, normalised, raw = (
+    inverse, normalised = (
         np.array([[c[f"CALIB_PLANE_{name}_{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
-        for name in ("INVERSE", "NORMALISED", "RAW")
+        for name in ("INVERSE", "NORMALISED")
     )
     ok.append(bool(np.allclose(inverse @ K, normalised, rtol=1e-4, atol=2e-6)))
-    del raw
     ok += [near(fx * c["CALIB_CAMERA_PER_FX"], 1.0), near(fy * c["CALIB_CAMERA_PER_FY"], 1.0)]
     rate = c["CALIB_TICK_RATE_HZ"]
     ok.append(near(1e3 * rate, c["CALIB_TICK_RATE_MHZ"]))
@@ -100,9 +99,9 @@ def _coherent(c: dict[str, float]) -> bool:
     return all(ok)
 
 
-def _build(folder: Path, text: str, undistort: int) -> list[str]:
+def _build(folder: Path, text: str, flag: str) -> list[str]:
     (folder / "calib_constants.h").write_text(text)
-    flags = ["-std=c99", "-O0", f"-DCALIB_UNDISTORT={undistort}", f"-I{folder}"]
+    flags = ["-std=c99", "-O0", flag, f"-I{folder}"]
     subprocess.run(["gcc", *flags, "-o", folder / "host", NATIVE / "program.c", "-lm"], check=True)
     return [str(folder / "host")]
 
@@ -159,13 +158,6 @@ def _coherent_fused(c: dict[str, float]) -> bool:
     return near and bool(np.allclose(rows @ bias, told, rtol=1e-4))
 
 
-def _build_fused(folder: Path, text: str) -> list[str]:
-    (folder / "calib_constants.h").write_text(text)
-    flags = ["-std=c99", "-O0", "-DCALIB_FUSED=1", f"-I{folder}"]
-    subprocess.run(["gcc", *flags, "-o", folder / "host", NATIVE / "program.c", "-lm"], check=True)
-    return [str(folder / "host")]
-
-
 @pytest.mark.slow
 def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -> None:
     """By a thousandth, or by one where it counts ticks: off by five times what rounding gives."""
@@ -174,7 +166,7 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
     constants, text = made.values, made.text
     write(tmp_path, made)
     ticks = _stimulus_fused(constants)
-    plain = run(_build_fused(tmp_path, text), ticks)
+    plain = run(_build(tmp_path, text, "-DCALIB_FUSED=1"), ticks)
     reference = FusedReference(constants)
     wanted = [reference.step(t, int(f)) for t, f in zip(ticks, plain.flags, strict=True)]
     table = np.array([out.numbers for out in wanted])
@@ -191,7 +183,7 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
             continue
         mutated = text.replace(f"#define {name} {literal} ", f"#define {name} {changed} ")
         assert mutated != text, name
-        found = run(_build_fused(tmp_path, mutated), ticks)
+        found = run(_build(tmp_path, mutated, "-DCALIB_FUSED=1"), ticks)
         off = np.abs(found.numbers - table).max(axis=0)
         if not ((off > 5.0 * rounding).any() or (found.flags != plain.flags).any()):
             unseen.append((name, float((off / rounding).max())))
@@ -203,12 +195,12 @@ def test_a_constant_of_the_fused_estimator_that_is_off_is_seen(tmp_path: Path) -
 def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: str, undistort: int) -> None:
     need("gcc")
     made = header(kind)
-    constants, text = made.values, made.text
+    constants, text, flag = made.values, made.text, f"-DCALIB_UNDISTORT={undistort}"
     assert _coherent(constants)
     write(tmp_path, made)
     ticks = _stimulus(constants)
     reference = Reference(constants, bool(undistort))
-    plain = run(_build(tmp_path, text, undistort), ticks)
+    plain = run(_build(tmp_path, text, flag), ticks)
     wanted = [reference.step(t, int(f)) for t, f in zip(ticks, plain.flags, strict=True)]
     table = np.array([out.numbers for out in wanted])
     flags = np.array([out.flags for out in wanted])
@@ -240,7 +232,7 @@ def test_a_constant_that_is_off_by_a_thousandth_is_seen(tmp_path: Path, kind: st
         else:
             mutated = text.replace(f"#define {name} {literal} ", f"#define {name} {changed} ")
         assert mutated != text, name
-        if not seen(_build(tmp_path, mutated, undistort)):
+        if not seen(_build(tmp_path, mutated, flag)):
             unseen.append(name)
     line = ("CALIB_FF_FROM_M", "CALIB_FF_SLOPE_PWM_PER_M", "CALIB_FF_LIMIT_PWM")
     table_names = ("calib_ff_table_pwm", "CALIB_FF_TABLE")

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from source_model import PRINTED_CREEP, PolynomialForce, kinetic_energy_J, pose_from_configuration, transform
@@ -548,29 +549,12 @@ def _against(rig: Callable[[], SimulatedRig], column: int) -> tuple[Plot, Values
     }
 
 
-def figure_3_13() -> tuple[Plot, Values]:
-    return _against(first_model, 0)
-
-
-def figure_3_14() -> tuple[Plot, Values]:
-    return _against(first_model, 1)
-
-
-def figure_3_15() -> tuple[Plot, Values]:
-    return _against(first_model, 2)
-
-
-def figure_3_18() -> tuple[Plot, Values]:
-    return _against(fitted_rig, 0)
-
-
-def figure_3_19() -> tuple[Plot, Values]:
-    return _against(fitted_rig, 1)
-
-
-def figure_3_20() -> tuple[Plot, Values]:
-    return _against(fitted_rig, 2)
-
+figure_3_13 = partial(_against, first_model, 0)
+figure_3_14 = partial(_against, first_model, 1)
+figure_3_15 = partial(_against, first_model, 2)
+figure_3_18 = partial(_against, fitted_rig, 0)
+figure_3_19 = partial(_against, fitted_rig, 1)
+figure_3_20 = partial(_against, fitted_rig, 2)
 
 # Pumps (2.3, 3.5)
 
