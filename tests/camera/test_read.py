@@ -68,7 +68,7 @@ def test_numbers_come_back_bit_for_bit(write) -> None:
         (HEADER + FOUR + "a,1,1,3\n", "line 6: has 4 values, expected 5"),
         (HEADER + "b,1,1,3,4\n" + FOUR, r"view b \(from line 2\) has 1 points, expected at least 4"),
         (HEADER.encode() + b"\xff\xfe\n", r"line 2 is not UTF-8 text \(byte 0xff\)"),
-        (HEADER + "a" * 70000, "line 2: has 1 values, expected 5"),
+        (HEADER + "a" * 70000, "line 2 has 65536 characters or more"),
     ],
 )
 def test_a_bad_table_is_answered_with_file_and_line(write, content: str | bytes, words: str) -> None:

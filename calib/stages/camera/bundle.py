@@ -253,8 +253,8 @@ def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], free
 #
 #     h1^T B h2 = 0,   h1^T B h1 = h2^T B h2
 #
-# are two equations linear in B for each view. Its four unknown ratios without skew need two views, and two
-# (principal point held at the image's centre) need one. A skew is small and no part of the guess.
+# are two equations linear in B for each view. Five unknown ratios of B (skew included) need three
+# views, four (no skew) need two, and two (principal point held at the image's centre) need one.
 
 
 def homographies(observations: Observations) -> FloatArray:
@@ -270,13 +270,13 @@ def _constraint(H: FloatArray, i: int, j: int) -> FloatArray:
     return np.asarray(both[:, [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] * [0.5, 1.0, 0.5, 1.0, 1.0, 0.5])
 
 
-def closed_form_intrinsics(H: FloatArray, image_size_px: tuple[int, int], centred: bool) -> FloatArray | None:
-    """K without skew from homographies, or None where noise, geometry or few views leave no real solution.
+def closed_form_intrinsics(H: FloatArray, image_size_px: tuple[int, int], unknowns: str) -> FloatArray | None:
+    """K from homographies, or None where noise or geometry leave no real solution.
 
     Parameters
     ----------
     H : (N, 3, 3).
-    centred : whether the principal point is held at the image's centre.
+    unknowns : "skew" (all of B), "no skew", or "centre" (principal point at the image's centre).
     """
     width, height = image_size_px
     size = 0.5 * (width + height)
@@ -287,12 +287,12 @@ def closed_form_intrinsics(H: FloatArray, image_size_px: tuple[int, int], centre
     Hn = normalise @ H
     Hn = Hn / np.linalg.norm(Hn, axis=(1, 2), keepdims=True)
     system = np.concatenate([_constraint(Hn, 0, 1), _constraint(Hn, 0, 0) - _constraint(Hn, 1, 1)])
-    kept = [0, 2, 5] if centred else [0, 2, 3, 4, 5]
+    kept = {"skew": [0, 1, 2, 3, 4, 5], "no skew": [0, 2, 3, 4, 5], "centre": [0, 2, 5]}[unknowns]
     if len(system) < len(kept) - 1:
         return None
     b = np.zeros(6)
     b[kept] = np.linalg.eigh(system[:, kept].T @ system[:, kept])[1][:, 0]
-    B = np.array([[b[0], 0.0, b[3]], [0.0, b[2], b[4]], [b[3], b[4], b[5]]]) * np.sign(b[0] or 1.0)
+    B = np.array([[b[0], b[1], b[3]], [b[1], b[2], b[4]], [b[3], b[4], b[5]]]) * np.sign(b[0] or 1.0)
     if np.linalg.eigvalsh(B)[0] <= 0.0:
         return None
     # B = K^-T K^-1 = L L^T with L lower triangular, hence K = L^-T up to scale.
@@ -345,26 +345,31 @@ def _mismatch(K: FloatArray, H: FloatArray) -> float:
     return float(np.mean(((aa - bb) ** 2 + 4 * ab**2) / (aa + bb) ** 2))
 
 
-def initial_guess(observations: Observations, image_size_px: tuple[int, int]) -> Block:
-    """Intrinsics without distortion and skew, and the poses of all views, to start the adjustment from.
+def initial_guess(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> Block:
+    """Intrinsics without distortion and the poses of all views, as a start for the bundle adjustment.
 
-    Zhang's closed form; where that has no plausible answer the principal point is held at the centre, and
-    where that fails too the focal length of a scan that makes the target's axes most nearly orthonormal is
-    taken.
+    Zhang's closed form with as many unknowns as the views allow; where that has no plausible answer
+    the principal point is held at the centre, and where that fails too the focal length of a scan
+    that makes the target's axes most nearly orthonormal is taken.
     """
     H = homographies(observations)
     width, height = image_size_px
     longest = float(max(width, height))
     centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
-    found = (closed_form_intrinsics(H, image_size_px, centred) for centred in (False, True))
+    attempts = (["skew"] if skew and observations.views >= 3 else []) + (
+        ["no skew"] if observations.views >= 2 else []
+    )
+    found = (closed_form_intrinsics(H, image_size_px, unknowns) for unknowns in [*attempts, "centre"])
     K = next((one for one in found if one is not None and _plausible(one, longest, centre)), None)
     if K is None:
         focal = longest * np.geomspace(0.3, 10.0, 60)
         candidates = [np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1.0]]) for f in focal]
         K = min(candidates, key=lambda candidate: _mismatch(candidate, H))
+    if not skew:
+        K[0, 1] = 0.0
     R_CT, t_CT_m = poses_from_homographies(K, H)
     intrinsics = np.zeros(len(INTRINSICS))
-    intrinsics[:4] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    intrinsics[:5] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]
     return Block(intrinsics, R_CT, t_CT_m)
 
 
@@ -478,9 +483,11 @@ class Calibration:
         return float(np.sqrt(psi / freedom) / share)
 
 
-def starting_block(observations: Observations, image_size_px: tuple[int, int], free: IntArray) -> Block:
+def starting_block(
+    observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray
+) -> Block:
     """Zhang's closed form as a start, with k1 and k2 by linear least squares where they are free."""
-    start = initial_guess(observations, image_size_px)
+    start = initial_guess(observations, image_size_px, skew)
     lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
     if not np.isin(lens, free).all():
         return start
@@ -535,7 +542,7 @@ def _fisheye_start(observations: Observations, image_size_px: tuple[int, int], f
     starts = [start for start in starts if start.posed.all()]
     tried = [minimise(start, observations, free, max_iterations=_TRIED_ITERATIONS) for start in starts]
     if not any(np.isfinite(one.cost) for one in tried):
-        return replace(initial_guess(observations, image_size_px), fisheye=True)
+        return replace(initial_guess(observations, image_size_px, skew=False), fisheye=True)
     return min(tried, key=lambda one: one.cost).block
 
 
@@ -571,7 +578,7 @@ def calibrate(
         start = (
             _fisheye_start(observations, image_size_px, free)
             if model == FISHEYE
-            else starting_block(observations, image_size_px, free)
+            else starting_block(observations, image_size_px, skew, free)
         )
     deformations = 0 if basis is None else len(basis)
     if len(start.deformation) != deformations:

@@ -10,6 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -545,6 +546,7 @@ COLUMNS = ("view", "x_m", "y_m", "u_px", "v_px")
 """Columns that a correspondence table must have."""
 
 _FEWEST = 4
+_LONGEST_LINE = 65536
 
 
 def _at(path: Path, line: int, what: str) -> BadInputError:
@@ -581,10 +583,12 @@ class _Points:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines of a text file, without their ends; never more than one line in memory.
 
-    Raises `BadInputError` for files that cannot be opened or are not UTF-8 text.
+    Raises `BadInputError` for files that cannot be opened, are not UTF-8 text or have lines of absurd length.
     """
     with to_be("read", path), path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
-        for number, text in enumerate(file, 1):
+        for number, text in enumerate(iter(partial(file.readline, _LONGEST_LINE), ""), 1):
+            if len(text) == _LONGEST_LINE:
+                raise BadInputError(f"{shown(path)}: line {number} has {_LONGEST_LINE} characters or more")
             if "\0" in text:
                 raise BadInputError(
                     f"{shown(path)}: line {number} has a zero byte; expected a text file, not binary data"
