@@ -1600,7 +1600,7 @@ def decrement(t_s: FloatArray, phi_rad: FloatArray, noise_rad: float = 0.0) -> D
 # is the one whose force at points left out is best; a higher one has to beat a lower by a twentieth.
 
 _ORDERS = (1, 2, 3)
-_BETTER = 0.95
+_HIGHER = 0.95
 
 
 @dataclass(frozen=True)
@@ -1670,7 +1670,7 @@ def fit_stiffness(name: str, elongation_m: FloatArray, force_N: FloatArray) -> t
     fits = [_one(eps, force, order) for order in _ORDERS if order < levels]
     best = 0
     for k in range(1, len(fits)):
-        if fits[k].left_out_rms_N < _BETTER * fits[best].left_out_rms_N:
+        if fits[k].left_out_rms_N < _HIGHER * fits[best].left_out_rms_N:
             best = k
     return fits, best
 
