@@ -454,9 +454,11 @@ def bank_event(
             weights[new, m] = weights[old, m]
     weights[new, count] = since
     if not again:
-        report[:] = math.nan
+        for k in range(12):
+            report[k] = math.nan
     report[11] = 0.0
-    trace[:, TRACE - 1] = 0.0
+    for k in range(trace.shape[0]):
+        trace[k, TRACE - 1] = 0.0
     stamp = stamp_variance(kind, noise, z)
     for m in range(count):
         x, P, out = bank_x[new, m], bank_P[new, m], work[m, 3]
