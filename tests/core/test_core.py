@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import errno
 import math
 import os
 import pickle
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -400,3 +402,18 @@ def test_a_value_has_the_digits_that_its_deviation_leaves(
     value: float, sigma: float | None, text: str
 ) -> None:
     assert number(value, sigma) == text
+
+
+def test_no_module_gives_a_name_twice() -> None:
+    """In a long module a second constant of one name silently takes the place of the first."""
+    twice = []
+    for path in Path(compilation.__file__).parents[1].rglob("*.py"):
+        module = ast.parse(path.read_text(encoding="utf-8"))
+        names = Counter(
+            target.id
+            for node in module.body
+            for target in getattr(node, "targets", [getattr(node, "target", None)])
+            if isinstance(target, ast.Name)
+        )
+        twice += [f"{path.name}: {name}" for name, count in names.items() if count > 1]
+    assert not twice
