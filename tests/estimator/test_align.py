@@ -95,6 +95,13 @@ def test_swing_and_ellipse_align_a_rig() -> None:
         assert abs(np.nanmean(before)) > 5.0 * abs(np.nanmean(after))
     figures = plots(cast("Align", SimpleNamespace(evidence=found, verdict=judge(found))))
     assert list(figures) == ["align_correlation", "align_residuals_1", "align_residuals_2"]
+    # Time that is stretched by 5 % is a scale of the gyroscope, which passed, and forces 10 % off.
+    stretched = replace(found, sensor=found.sensor + 0.05 * (np.array(SENSOR) == "gyro_scale"))
+    texts = {"poor": "the gyroscope's scale came out as", "ok": ""}
+    for one, word in ((found, "ok"), (stretched, "poor")):
+        verdict = judge(one)
+        assert verdict.word == word
+        assert any(finding.text.startswith(texts[word]) for finding in verdict.findings)
 
 
 @pytest.mark.few(2)

@@ -1642,6 +1642,12 @@ _TURNS = (
     "arm about a pin, such as a pendulum, which turns half as far as one that bends"
 )
 _BEYOND_PRIOR = 4.0
+_GYRO_SCALE = 0.04
+"""Of a gyroscope whose scale nobody calibrated: data sheets (BNO055, MPU-6050) allow 3 %."""
+_STRETCHED = (
+    "check that t_s runs in seconds and is no count of samples: a stretched time looks the same, and forces "
+    "err by twice as much; if the gyroscope is so, find its scale with calib imu intrinsics"
+)
 _NOTHING_LEARNT = 0.8
 _INSEPARABLE = 0.98
 _TURNED_RAD = 0.02
@@ -1809,13 +1815,15 @@ def _known(found: Alignment) -> Iterator[Finding]:
                 f"by the logs the plane is {value:.2g} +- {spread:.1g} mm aside, or the marker on the head",
                 _MOVED,
             )
+        stretched = name == "gyro_scale" and abs(found.sensor[k] - found.mean[k]) > _GYRO_SCALE
         # A delay that the logs tell is a delay, however long.
-        if away > _BEYOND_PRIOR and (k != _OFFSET or offset > _OFFSET_S[0]):
+        if stretched or (away > _BEYOND_PRIOR and (k != _OFFSET or offset > _OFFSET_S[0])):
             # In the units of the table.
             scale, unit = _SHOWN.get(unit_of(name), (1.0, unit_of(name)))
             value, mean, spread = (scale * float(x[k]) for x in (found.sensor, found.mean, found.prior))
             text = f"came out as {value:.3g} {unit}, expected {mean:.3g} +- {spread:.2g} {unit}"
-            yield Finding("poor", f"{QUANTITIES[name].words} {text}", _MOVED if name in _SHIFTS else "")
+            advice = _MOVED if name in _SHIFTS else _STRETCHED if stretched else ""
+            yield Finding("poor", f"{QUANTITIES[name].words} {text}", advice)
 
 
 def _separable(found: Alignment) -> Iterator[Finding]:
