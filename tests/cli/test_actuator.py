@@ -142,8 +142,14 @@ def test_logs_that_cannot_be_used_end_in_a_sentence(
         row[where["pwm1"]] = "0.9" if row[where["pwm1"]] else ""
         return row
 
+    def percent(row: list[str], where: dict[str, int]) -> list[str]:
+        if row[where["pwm1"]]:
+            row[where["pwm1"]], row[where["pwm2"]] = "100", "39.2"
+        return row
+
     for change, words in (
         (share, "pwm1 and pwm2 are 0.9 at most, expected 0 to 255"),
+        (percent, "pwm1 and pwm2 are 100 at most and not whole, as a percentage"),
         (late, "the clock jumps"),
         (short, "expected at least 40"),
         (mute, "has no commands"),

@@ -114,18 +114,7 @@ def read_pump_table(
     if len(outside):
         line = lines[kept[int(outside[0])]]
         raise BadInputError(f"{shown(path)}, line {line}: PWM is {u[outside[0]]:g}, expected 0 to 255")
-    if 0.0 < float(u.max()) <= 1.0:
-        raise BadInputError(
-            f"{shown(path)}: PWM is {float(u.max()):.3g} at most, expected 0 to 255; where it is a share of "
-            "the full duty, multiply the column by 255"
-        )
-    if u.max() == 100.0:
-        if np.any(u % 1.0):
-            raise BadInputError(
-                f"{shown(path)}: PWM is 100 at most and not whole, as a percentage, expected 0 to 255; "
-                "multiply the column by 2.55"
-            )
-        said.append("PWM is 100 at most, taken for 100 of 255; multiply a percentage by 2.55")
+    said += _duty(shown(path), "PWM is", u, "multiply the column by {}")
     back = np.nonzero(np.diff(t) < 0.0)[0]
     if len(back):
         line = lines[kept[int(back[0]) + 1]]
@@ -147,6 +136,24 @@ def read_pump_table(
             "vacuum; subtract the pressure of the air"
         )
     return PumpTable(unit, record, settled, tuple(said))
+
+
+def _duty(source: str, name: str, pwm: FloatArray, remedy: str) -> list[str]:
+    """A sentence where PWM may be a percentage.
+
+    Raises `BadInputError` for shares of the full duty and surely percentages; `remedy` takes the factor.
+    """
+    most = float(pwm.max())
+    found = f"{name} {most:.3g} at most"
+    if 0.0 < most <= 1.0:
+        also = "expected 0 to 255; where that is a share of the full duty"
+        raise BadInputError(f"{source}: {found}, {also}, {remedy.format(255)}")
+    if abs(most - 100.0) > 1e-6:
+        return []
+    if np.any(pwm % 1.0):
+        also = "and not whole, as a percentage, expected 0 to 255"
+        raise BadInputError(f"{source}: {found} {also}; {remedy.format(2.55)}")
+    return [f"{source}: {found}, taken for 100 of 255; where that is a percentage, {remedy.format(2.55)}"]
 
 
 def _settled(
@@ -417,11 +424,8 @@ def _commands(log: Log, no_pwm: bool, said: list[str]) -> tuple[float, float, Fl
             raise BadInputError(found)
         said.append(f"{found}; {count} of {len(pwm)} commands are such and are left out")
         t, pwm = t[~wrong], pwm[~wrong]
-    if 0.0 < float(pwm.max()) <= 1.0:
-        raise BadInputError(
-            f"{log.source}: pwm1 and pwm2 are {float(pwm.max()):.3g} at most, expected 0 to 255; where they "
-            "are shares of the full duty, columns.yaml takes them: `pwm1: {column: pwm1, factor: 255}`"
-        )
+    remedy = "columns.yaml takes them: `pwm1: {{column: pwm1, factor: {}}}`, and pwm2 so"
+    said += _duty(log.source, "pwm1 and pwm2 are", pwm, remedy)
     # A nominal rate that the stamps only scatter about is exact.
     tick_s = 1.0 / commands.axis.nominal_hz if len(t) > 2 else TICK_S
     # Some loggers write a command where it changes; it holds until the next one.
