@@ -211,6 +211,15 @@ def test_a_clock_that_steps_midway_is_named() -> None:
     assert finding.text.startswith("from ")
 
 
+def test_pictures_of_another_size_are_no_delay() -> None:
+    """In each stretch they look like another one, which was named."""
+    _, log = driven_log("ellipse")
+    columns = {**log.columns, **{name: 0.97 * log.columns[name] for name in ("u_px", "v_px")}}
+    (finding,) = untimely(setup_for(varied_drive(0)), rows_from(replace(log, columns=columns)))
+    assert "by no one delay: as if from " in finding.text
+    assert "the pictures' resolution" in finding.advice
+
+
 @pytest.mark.parametrize("k", [0, 2, 5, 30, 54])
 @pytest.mark.parametrize("gap_s", [0.0, 10.0])
 def test_a_jump_before_a_gap_or_at_an_end_is_looked_at(k: int, gap_s: float) -> None:

@@ -729,22 +729,41 @@ def untimely(setup: Setup, rows: Rows, place: str = "pictures") -> Iterator[Find
 
     Each of `_TOGETHER` is moved by some samples, and the kinematic filter runs again; a move that gains goes
     on while it does. One column's delay looks like the opposite one of the others: what gains nearly as much
-    as the best is named beside it. A delay in a log at rest shows nothing.
+    as the best is named beside it. A delay in a log at rest shows nothing. Other faults look like delays, but
+    in each stretch like another one.
     """
+    found: list[tuple[dict[str, int], str]] = []
     for stretch in _moving(setup, rows):
         if late := _late(setup, stretch):
             a, b = stretch.t_s[[0, -1]].tolist()
+            period_ms = 1e3 * float(np.median(np.diff(stretch.taken_s[stretch.kinds >= 2])))
+            words = ", or ".join(
+                text.format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
+                for text, shift in late.items()
+            ).replace("pictures", place)
             between = f"from {a:.1f} to {b:.1f} s " if len(stretch) < len(rows) else ""
-            yield Finding(
-                "inconsistent",
-                between + ", or ".join(late).replace("pictures", place),
-                "check how the log gets its times, or run calib align on logs of the same recorder",
-            )
-            return
+            found.append((late, between + words))
+        if len(found) == 2:
+            break
+    if not found:
+        return
+    texts = [text for _, text in found]
+    first, last = found[0][0], found[-1][0]
+    same = [first[text] for text in first.keys() & last.keys() if abs(last[text] - first[text]) < 2]
+    if any(abs(shift) < _LATEST for shift in same):
+        advice = "check how the log gets its times, or run calib align on logs of the same recorder"
+        yield Finding("inconsistent", texts[0], advice)
+    else:
+        yield Finding(
+            "inconsistent",
+            f"the readings contradict each other, by no one delay: as if {', but '.join(texts)}",
+            "check the columns of this log: their order, signs and units, and the pictures' resolution; or "
+            "the camera or the IMU has moved since the alignment",
+        )
 
 
-def _late(setup: Setup, rows: Rows) -> list[str]:
-    """Which columns come late in a stretch, in words, the likeliest first."""
+def _late(setup: Setup, rows: Rows) -> dict[str, int]:
+    """Samples by which columns come late in a stretch, by what is said of it, the likeliest first."""
     at = OUT.index("log_likelihood")
 
     @cache
@@ -772,13 +791,12 @@ def _late(setup: Setup, rows: Rows) -> list[str]:
             while abs(shift) < _LATEST and likelihood(names, shift + step) > likelihood(names, shift):
                 shift += step
             found[names] = max(found.get(names, (-math.inf, 0)), (likelihood(names, shift), shift))
-    period_ms = 1e3 * float(np.median(np.diff(rows.taken_s[rows.kinds >= 2])))
     best = max((value for value, _ in found.values()), default=0.0)
-    return [
-        _TOGETHER[names].format(f"{abs(shift) * period_ms:.0f} ms {'after' if shift > 0 else 'before'}")
+    return {
+        _TOGETHER[names]: shift
         for names, (value, shift) in sorted(found.items(), key=lambda item: -item[1][0])
         if value > best - _GAIN
-    ]
+    }
 
 
 # ----------------------------------------------------------------------
