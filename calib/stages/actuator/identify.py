@@ -2099,9 +2099,12 @@ def _apart(solution: Solution, known: Uncertainty) -> Iterator[Finding]:
         text = (
             f"{moved.name}: its pictures are shifted {when}, as if the head had turned by "
             f"{math.degrees(moved.phi_rad):+.1f} degrees and grown by {1e3 * moved.length_m:+.1f} mm; the "
-            "camera, or the marker on the head, has moved"
+            "camera, or the marker on the head, has moved, or a pump answers otherwise"
         )
-        advice = f"{then} calibrate the plane anew (calib extrinsics) for the pictures after that"
+        advice = (
+            f"{then} calibrate the plane anew (calib extrinsics) for the pictures after that; where calib "
+            "replay finds that pictures and IMU agree, look at the pumps, their hoses and the commands' unit"
+        )
         yield Finding("inconsistent", text, advice)
     for name, alike in crossed(solution).items():
         if alike < _CROSSED:
