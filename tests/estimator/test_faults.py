@@ -18,6 +18,7 @@ from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive, Handover
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import READINGS
 from calib.stages.estimator.replay import (
+    captured,
     consistent,
     contradicting,
     grown,
@@ -218,6 +219,24 @@ def test_pictures_of_another_size_are_no_delay() -> None:
     (finding,) = untimely(setup_for(varied_drive(0)), rows_from(replace(log, columns=columns)))
     assert "by no one delay: as if from " in finding.text
     assert "the pictures' resolution" in finding.advice
+
+
+def test_a_marker_that_stands_while_the_head_turns_is_named() -> None:
+    """It was said to jump, as of a camera that has moved; at rest whole pixels repeat, and a bias turns."""
+    for scenario in ("ellipse", "static"):
+        _, log = driven_log(scenario)
+        assert not list(captured(log, False))
+        columns, seen = dict(log.columns), log.sampled("u_px")
+        held = seen[(log.t_s[seen] >= 4.0) & (log.t_s[seen] <= 9.0)]
+        for name in ("u_px", "v_px"):
+            columns[name] = columns[name].copy()
+            columns[name][held] = columns[name][held[0]]
+        columns["gz_radps"] = columns["gz_radps"] + 0.05
+        told = [one.text for one in captured(replace(log, columns=columns), False)]
+        assert len(told) == (scenario == "ellipse")
+        assert not told or told[0].startswith(
+            "the marker's place stays the same to the digit from 4.0 to 9.0 s"
+        )
 
 
 @pytest.mark.parametrize("k", [0, 2, 5, 30, 54])

@@ -194,22 +194,26 @@ def bend_apart_rad(log: Log) -> float:
     return rms(np.array([np.median(part) for part in parts])) if len(away) else math.nan
 
 
-def stuck_place(log: Log) -> tuple[float, float, float] | None:
-    """The time from and to [s] in which the tip's place repeats to the digit for longest, and by how much the
-    gyroscope turns meanwhile [rad]; None where none repeats for a second or the gyroscope is silent.
+def stuck_place(log: Log, names: tuple[str, str] = PLACE) -> tuple[float, float, float] | None:
+    """The time from and to [s] in which a place repeats to the digit and the gyroscope turns most, and by how
+    much [rad], beyond an even rate, as of a bias; None where none repeats for a second or the gyroscope is
+    silent.
     """
-    seen, turning = log.sampled(*PLACE), log.sampled("gz_radps")
+    seen, turning = log.sampled(*names), log.sampled("gz_radps")
     if len(seen) < 2 or len(turning) < 2:
         return None
-    place, t = np.stack([log.columns[name][seen] for name in PLACE]), log.t_s[seen]
-    same = runs((place[:, 1:] == place[:, :-1]).all(axis=0))
-    first, last = max(((t[a], t[b]) for a, b in same), key=lambda one: one[1] - one[0], default=(0.0, 0.0))
-    if not last - first >= _STUCK_S:
-        return None
+    place, t = np.stack([log.columns[name][seen] for name in names]), log.t_s[seen]
     rate, at = log.columns["gz_radps"][turning], log.t_s[turning]
     turned = np.concatenate([[0.0], np.cumsum(rate[:-1] * np.diff(at))])
-    inside = turned[(at >= first) & (at <= last)]
-    return float(first), float(last), float(np.ptp(inside)) if len(inside) else 0.0
+    out = None
+    for a, b in runs((place[:, 1:] == place[:, :-1]).all(axis=0)):
+        inside = (at >= t[a]) & (at <= t[b])
+        if not t[b] - t[a] >= _STUCK_S or inside.sum() < 3:
+            continue
+        off = turned[inside] - np.polyval(np.polyfit(at[inside], turned[inside], 1), at[inside])
+        if out is None or np.ptp(off) > out[2]:
+            out = float(t[a]), float(t[b]), float(np.ptp(off))
+    return out
 
 
 def _placed(log: Log) -> Log:

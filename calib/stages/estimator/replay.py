@@ -615,7 +615,8 @@ def grown(longer_m: float, sigma_m: float) -> Iterator[Finding]:
             f"the actuator rests {1e3 * abs(longer_m):.1f} mm {'longer' if longer_m > 0 else 'shorter'} than "
             f"identified, {abs(longer_m) / sigma_m:.1f} times its sigma: the camera has moved along it, or "
             "it has changed",
-            "find the plane again (calib extrinsics); if that is as it was, run calib identify again",
+            "find the plane again (calib extrinsics); if that is as it was, measure the rest length again, "
+            "where known states it, and run calib identify again",
         )
 
 
@@ -654,8 +655,8 @@ def leaning(setup: Setup, tally: Tally) -> Iterator[Finding]:
 
 
 def captured(first: Log, pose: bool) -> Iterator[Finding]:
-    """Findings where the tip's angle is not that of the arc from the base to its place, and where that stands
-    still while the gyroscope turns; `pose` where it stands for pictures.
+    """Findings where the tip's angle is not that of the arc from the base to its place, and where that, or
+    the marker, stands still while the gyroscope turns; `pose` where it stands for pictures.
     """
     apart = bend_apart_rad(first)
     if apart > _NO_ARC_RAD:
@@ -666,13 +667,14 @@ def captured(first: Log, pose: bool) -> Iterator[Finding]:
             "look at their order, signs and units: x and phi grow to one side, y from the base along the "
             "straight actuator",
         )
-    stuck = stuck_place(first) if pose else None
+    stuck = stuck_place(first) if pose else stuck_place(first, READINGS[:2])
     if stuck is not None and stuck[2] > _NO_ARC_RAD:
+        what, lost = ("tip", "motion capture") if pose else ("marker", "tracker")
         yield Finding(
-            "poor",
-            f"the tip's place stays the same to the digit from {stuck[0]:.1f} to {stuck[1]:.1f} s, in which "
-            f"the gyroscope turns by {math.degrees(stuck[2]):.0f} degrees",
-            "the motion capture has lost the tip: leave these cells blank",
+            "inconsistent",
+            f"the {what}'s place stays the same to the digit from {stuck[0]:.1f} to {stuck[1]:.1f} s, in "
+            f"which the gyroscope turns by {math.degrees(stuck[2]):.0f} degrees to and fro",
+            f"the {lost} has lost the {what}: leave these cells blank",
         )
 
 
@@ -969,16 +971,16 @@ def _replayed(
     checks = {named[name]: check for name in SENSORS if (check := tally.check(name)) is not None}
     share = sums.driven / sums.weighed if own and sums.weighed else None
     if own:
-        seen = list(sampled(sums.watch))
+        seen = [*sampled(sums.watch), *captured(log.first, log.periods.pose)]
         findings = [*seen, *findings]
-        # A sensor that is stuck or mirrored seems late, too; innovations that are white hide no delay.
+        # What is stuck or mirrored seems late, and to jump; innovations that are white hide no delay.
+        sound = all(one.severity != "inconsistent" for one in seen)
         repeats = any((check.correlation or 0.0) > _REPEATING for check in checks.values())
-        if repeats and all(one.severity != "inconsistent" for one in seen):
+        if repeats and sound:
             findings += untimely(log.setup, rows_of(log.first, log.periods), place)
         findings += coarse(log)
-        findings += captured(log.first, log.periods.pose)
         if log.both and not log.periods.pose:
-            findings += jumped(tally)
+            findings += jumped(tally) if sound else []
             findings += leaning(log.setup, tally)
         repeating = tally.repeating() if log.periods.grid_px > 0.0 else None
         findings += consistent(checks, tally.flags, max(tally.rows, 1), log.quiet, repeating)
