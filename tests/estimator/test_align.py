@@ -352,7 +352,9 @@ def test_columns_that_are_swapped_are_judged() -> None:
         for k, (name, options) in enumerate(MOTIONS[1:3])
     ]
     logs = [replace(log, pixels=log.pixels[:, ::-1].copy()) for log in logs]
-    assert judge(align(logs, prior_settings(trial.view))).word == "unidentifiable"
+    verdict = judge(align(logs, prior_settings(trial.view)))
+    assert verdict.word == "unidentifiable"
+    assert any("something else" in one.text and "their order" in one.advice for one in verdict.findings)
 
 
 @pytest.mark.few(2)

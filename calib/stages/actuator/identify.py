@@ -1857,7 +1857,8 @@ def _bounds(solution: Solution) -> list[str]:
 
 
 def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -> list[Finding]:
-    out = [Finding("poor", text) for text in _bounds(solution)]
+    advice = "look at what known states: the mass, gravity and the bellows' radius are in all forces"
+    out = [Finding("poor", text, advice) for text in _bounds(solution)]
 
     def poor(text: str) -> None:
         out.append(Finding("poor", text))

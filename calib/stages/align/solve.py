@@ -1641,6 +1641,7 @@ _TURNS = (
     "check the gyroscope's unit and axis, and the squares' length; calib align is not for a head on a stiff "
     "arm about a pin, such as a pendulum, which turns half as far as one that bends"
 )
+_COLUMNS = "check the columns of the logs: their order, signs, units and times"
 _BEYOND_PRIOR = 4.0
 _GYRO_SCALE = 0.04
 """Of a gyroscope whose scale nobody calibrated: data sheets (BNO055, MPU-6050) allow 3 %."""
@@ -1663,6 +1664,7 @@ def _data(found: Alignment) -> Iterator[Finding]:
         yield Finding(
             "unidentifiable" if share > _OUTLIERS[1] else "poor",
             f"{100.0 * share:.0f} % of {pictures} pictures show something else than the marker",
+            "look for a second thing of its colour; else " + _COLUMNS,
         )
     # One log on a wrong clock is few among many.
     for log in found.logs if len(found.logs) > 1 else ():
@@ -1671,7 +1673,8 @@ def _data(found: Alignment) -> Iterator[Finding]:
                 "poor",
                 f"{log.name}: {100.0 * log.outliers / log.pictures:.0f} % of its {log.pictures} pictures do "
                 f"not fit the IMU, expected {100.0 * _OUTLIERS[0]:.0f} % at most",
-                f"check the clock of {log.name}, or the offset that joined it, and what its marker is",
+                f"check the clock of {log.name}, or the offset that joined it, what its marker is, and "
+                "whether camera and IMU stood as in the other logs",
             )
     if abs(found.pace) > _SURE_PACE * found.pace_sigma and abs(found.pace) * found.span_s > _PACE_S:
         yield Finding(
@@ -1726,8 +1729,7 @@ def _contradicted(found: Alignment) -> Iterator[Finding]:
             "poor",
             "pictures contradict the IMU: they miss the fit in the same way from one to the next, "
             f"correlation {correlation:.2f}",
-            "check the columns of the logs: their order, signs, units and times; delays are looked for from "
-            f"{OFFSETS_S[0]:.1f} to {OFFSETS_S[-1]:.1f} s",
+            f"{_COLUMNS}; delays are looked for from {OFFSETS_S[0]:.1f} to {OFFSETS_S[-1]:.1f} s",
         )
 
 
