@@ -16,7 +16,7 @@ from calib.io.logs import Log
 from calib.solve.clock import Part
 from calib.stages.imu.drift import allan_at, analyse_drift, lag_s, slope_of
 from calib.stages.imu.mahony import Mahony, advance, filter_log
-from calib.stages.imu.read import Reading, tune_log
+from calib.stages.imu.read import Reading, drift_log, tune_log
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.tracks import Tuned, tracks_of
 from calib.stages.imu.tuning import smooth_log
@@ -117,6 +117,26 @@ def test_tuning_moves_a_truth_that_comes_late(late_s: float) -> None:
     columns["gz_radps"] = columns["gz_radps"] + 0.004 * np.random.default_rng(0).normal(size=len(t))
     log = Log("log.csv", t, columns | {"true_phi_rad": phi}, np.arange(len(t)))
     assert tune_log(log, Reading(False, "truth")).lag_s == pytest.approx(late_s, abs=1e-3)
+
+
+def test_a_truth_in_bursts_is_where_the_readings_are() -> None:
+    t = PERIOD * np.arange(4000)
+    turning = _log(0.5 * np.sin(0.6 * t), 0.3 * np.cos(0.6 * t)).values
+    stamps = t[np.minimum(np.arange(4000) // 10 * 10 + 9, 3999)]
+    columns = {"gz_radps": turning[:, 2], "ax_mps2": turning[:, 3], "ay_mps2": turning[:, 4]}
+    log = Log("log.csv", stamps, columns | {"true_phi_rad": 0.5 * np.sin(0.6 * t)}, np.arange(4000))
+    truth = analyse_drift(drift_log(log), peers=False).truth_rad
+    assert truth is not None
+    assert np.isfinite(truth[0]).mean() > 0.99
+
+
+def test_a_truth_of_another_motion_is_told() -> None:
+    t = PERIOD * np.arange(4000)
+    phi, rate = 0.5 * np.sin(0.6 * t), 0.3 * np.cos(0.6 * t)
+    log = replace(_log(phi, rate), true_t_s=t, true_phi_rad=phi)
+    assert not analyse_drift(log, peers=False).findings
+    (finding,) = analyse_drift(replace(log, true_phi_rad=-phi), peers=False).findings
+    assert "rate and true_phi_rad contradict each other" in finding.text
 
 
 Noise = Callable[[np.random.Generator, int], np.ndarray]

@@ -16,7 +16,8 @@ from scipy.special import stdtrit
 from calib.core.arrays import BoolArray, FloatArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
-from calib.core.verdict import Verdict
+from calib.core.verdict import Finding, Verdict
+from calib.solve.clock import Part
 from calib.solve.delay import vertex
 from calib.stages.imu.allan import allan_variance
 from calib.stages.imu.mahony import Mahony, mean_angle, wrapped
@@ -32,8 +33,8 @@ from calib.stages.imu.sampling import (
     without_gaps,
 )
 from calib.stages.imu.section import Drift, DriftGains, DriftMethod, DriftOfLog, DriftSlopes
-from calib.stages.imu.tracks import Track, Tuned, on_grid, tracks_of
-from calib.stages.imu.tuning import parameters_of
+from calib.stages.imu.tracks import Track, Tuned, on_grid, rate_of, tracks_of
+from calib.stages.imu.tuning import contradicted, parameters_of
 
 # ----------------------------------------------------------------------
 # What is said of the error of an angle: its slope with an interval, its lag, its Allan deviation.
@@ -267,6 +268,7 @@ class LogDrift:
     start_s : time of each part's first sample. period_s : from each to the next.
     truth_rad : the true angle in each part, NaN outside of its samples; None without.
     tracks : of each method.
+    findings : on a truth that is another motion's.
     """
 
     section: DriftOfLog
@@ -274,6 +276,7 @@ class LogDrift:
     period_s: float
     truth_rad: tuple[FloatArray, ...] | None
     tracks: tuple[Track, ...]
+    findings: tuple[Finding, ...]
 
 
 def _settled(start: int, stop: int, period_s: float) -> slice:
@@ -428,7 +431,19 @@ def analyse_drift(
         skipped=skipped,
         remarks=[*_remarks(log, sampling, late_s)],
     )
-    return LogDrift(section, tuple(float(part.t_s[0]) for part in parts), period_s, truth, tuple(tracks))
+    starts = tuple(float(part.t_s[0]) for part in parts)
+    return LogDrift(section, starts, period_s, truth, tuple(tracks), (*_untrue(log, parts, truth or ()),))
+
+
+def _untrue(log: Readings, parts: Sequence[Part], truth: Sequence[FloatArray]) -> Iterator[Finding]:
+    """A finding where a true angle turns otherwise than the gyroscope, by -gz and by the up vector alike."""
+    for part, seen in zip(parts, truth, strict=False):
+        ways = (False,) if log.lacks else (False, True)
+        apart = [contradicted(part.t_s, rate_of(part, log.axes, tilted), seen) for tilted in ways]
+        if all(apart):
+            text = f"{log.source}: rate and true_phi_rad contradict each other: {apart[0]}"
+            yield Finding("inconsistent", text, "check the columns, signs and units of that log")
+            return
 
 
 def spread_of(logs: Sequence[DriftOfLog]) -> dict[str, DriftSlopes]:
@@ -479,7 +494,7 @@ def solve_drift(
             **parameters_of(tuned.gains),
             rate_of_angle="up vector" if tuned.up_vector else "-gz",
         ),
-        **judged(Verdict.of(sensor_findings(logs))),
+        **judged(Verdict.of([*sensor_findings(logs), *(one for log in analysed for one in log.findings)])),
     ).with_evidence(analysed)
 
 

@@ -21,7 +21,7 @@ from calib.core.rig import Rig
 from calib.core.verdict import Finding
 from calib.io.columns import ACCEL, GYRO
 from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
-from calib.solve.clock import Part
+from calib.solve.clock import Part, time_axis
 from calib.solve.delay import delay_of
 from calib.stages.imu.drift import truth_late_s
 from calib.stages.imu.levelling import GAP_S
@@ -65,7 +65,10 @@ def _readings(log: Log, *needed: str, counts: bool = False) -> Signals:
 def _angle(log: Log, name: str) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and readings (k,) of an angle, empty where it is not logged."""
     rows = log.sampled(name)
-    return log.t_s[rows], log.columns[name][rows] if len(rows) else np.zeros(0)
+    if not len(rows):
+        return np.zeros(0), np.zeros(0)
+    # As those of the IMU: samples of a burst were not taken at the one time that they are stamped with.
+    return time_axis(np.maximum.accumulate(log.t_s[rows])).t_s, log.columns[name][rows]
 
 
 def rest_log(log: Log) -> Readings:

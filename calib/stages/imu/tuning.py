@@ -921,7 +921,7 @@ def _level(t_s: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _against(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> str:
+def contradicted(t_s: FloatArray, rate_radps: FloatArray, seen_rad: FloatArray) -> str:
     """How a rate contradicts a reference of its angle; empty where it does not or hardly anything turns."""
     known = np.isfinite(seen_rad)
     theta = integral(t_s, rate_radps)
@@ -1065,7 +1065,7 @@ def _contradiction(piece: Piece, own: Smoothed | None, noise: Noise) -> tuple[st
     A rate that errs is "poor" alone, for a sensor that lies flat errs as one with wrong columns does.
     """
     t_s, rate, seen = piece.t_s, piece.rate_radps, piece.reference_rad
-    if seen is not None and (what := _against(t_s, rate, seen)):
+    if seen is not None and (what := contradicted(t_s, rate, seen)):
         return f"rate and reference contradict each other: {what}", "inconsistent"
     if own is None or not piece.in_plane:
         return None
