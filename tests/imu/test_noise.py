@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 from calib.solve.clock import Part
 from calib.stages.imu.allan import (
     Term,
+    _whitened,
     allan_variance,
     analyse,
     bounds,
@@ -105,6 +106,25 @@ def test_densities_lie_in_their_intervals() -> None:
             total += 1
     assert held_N >= 0.88 * total
     assert held_K >= 0.85 * total
+
+
+def test_noise_that_long_times_alone_colour_is_white_at_short_ones() -> None:
+    rng, n, period_s = np.random.default_rng(1), 120_000, 0.004
+    share = math.exp(-period_s / 14.0)
+    slow = lfilter([1.4 * math.sqrt(1.0 - share**2)], [1.0, -share], rng.normal(size=(2, n)))
+    found = analyse([rng.normal(size=n) / math.sqrt(period_s) + slow[1]], period_s)
+    assert found.fit_s[0] == period_s
+    assert found.N.value == pytest.approx(1.0, abs=4.0 * found.N.sigma)
+
+
+def test_a_covariance_that_sums_leave_indefinite_still_weighs() -> None:
+    A = np.random.default_rng(0).normal(size=(5, 5))
+    C = A @ A.T
+    white = _whitened(C, np.eye(5))
+    assert white @ C @ white.T == pytest.approx(np.eye(5), abs=1e-9)
+    values, V = np.linalg.eigh(np.full((5, 5), 0.999) + 0.001 * np.eye(5))
+    indefinite = (V * (values - 0.0015)) @ V.T
+    assert np.abs(_whitened(indefinite, np.ones(5))).max() < 10.0
 
 
 def test_several_logs_give_their_mean_and_its_spread() -> None:

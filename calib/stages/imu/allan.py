@@ -258,18 +258,26 @@ def model_variance(theta: FloatArray, tau_s: FloatArray) -> FloatArray:
     return design(tau_s) * theta
 
 
+def _whitened(C: FloatArray, columns: FloatArray) -> FloatArray:
+    """Columns (j, ...) whose errors have the covariance C, turned and scaled so that theirs is one."""
+    # Variances span decades; relative ones keep the matrix well conditioned.
+    size = np.sqrt(np.diag(C))
+    values, V = np.linalg.eigh(C / np.outer(size, size))
+    # Sums over lags that end somewhere leave eigenvalues below zero where a walk ties all times together.
+    least = max(1e-9, -float(values[0]))
+    return np.asarray(((V.T @ (columns.T / size).T).T / np.sqrt(np.maximum(values, least))).T)
+
+
 def _least_squares(
     variance: FloatArray, D: FloatArray, C: FloatArray, active: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """theta (3,) and its covariance (3, 3), zero for inactive terms."""
-    # Variances span decades; relative ones keep the matrix well conditioned.
-    size = np.sqrt(np.diag(C))
-    L = np.linalg.cholesky(C / np.outer(size, size) + 1e-9 * np.eye(len(size)))
-    W = np.linalg.solve(L, D[:, active] / size[:, None])
+    white = _whitened(C, np.column_stack([D[:, active], variance]))
+    W = white[:, :-1]
     scale = np.linalg.norm(W, axis=0)
     inverse = np.linalg.inv((W / scale).T @ (W / scale)) / np.outer(scale, scale)
     theta, covariance = np.zeros(3), np.zeros((3, 3))
-    theta[active] = inverse @ (W.T @ np.linalg.solve(L, variance / size))
+    theta[active] = inverse @ (W.T @ white[:, -1])
     covariance[np.ix_(active, active)] = inverse
     return theta, covariance
 
@@ -296,9 +304,7 @@ def _settle(
 
 
 def _chance(variance: FloatArray, D: FloatArray, C: FloatArray, theta: FloatArray, terms: int) -> float:
-    size = np.sqrt(np.diag(C))
-    residual = (variance - D @ theta) / size
-    chi2 = float(residual @ np.linalg.solve(C / np.outer(size, size) + 1e-9 * np.eye(len(size)), residual))
+    chi2 = float((_whitened(C, variance - D @ theta) ** 2).sum())
     return float(chdtrc(max(len(variance) - terms, 1), chi2))
 
 
@@ -375,6 +381,13 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
     first, fit = 0, since(0)
     if fit.chance <= _WORST_CHANCE:
         start = next((k for k in range(1, least + 1) if since(k).chance > _WORST_CHANCE), 0)
+        # Short times that the model explains by themselves are not what is unlike it.
+        if (
+            start + 1 >= _FEWEST
+            and _select(variance[: start + 1], m_fit[: start + 1], G[: start + 1, : start + 1]).chance
+            > _WORST_CHANCE
+        ):
+            start = 0
         # Where none fits it is not the short times that are unlike the model.
         first = max(start, min(start + _MARGIN, len(m_fit) - _FEWEST)) if start else 0
         fit = since(first)

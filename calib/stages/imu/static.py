@@ -427,7 +427,7 @@ def _of_axis(noise: AxisNoise) -> Iterator[Finding]:
     elif not N.sigma <= _MOST_SIGMA_OF_N * N.value:
         share = N.sigma / N.value if N.value > 0.0 else math.inf
         yield Finding("poor", f"{axis}: the white noise is known to {share:.0%} only; the log is too short")
-    if axis.startswith("g") and N.value < _LEAST_GYRO_NOISE:
+    if axis.startswith("g") and N.value < _LEAST_GYRO_NOISE and allan.chance >= _LEAST_CHANCE:
         yield Finding(
             "poor",
             f"{axis}: its noise of {math.degrees(N.value):.2g} deg/s/sqrt(Hz) is less than any small "
