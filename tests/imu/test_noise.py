@@ -37,7 +37,7 @@ IMU = Imu(gyro_scale=(0.0, 0.0, 0.0), accel_scale=(0.0, 0.0, 0.0), mount_angle_r
 
 def _at_rest(n: int) -> HeadMotion:
     zero = np.zeros(n)
-    return HeadMotion(zero, zero, zero, np.zeros((n, 2)), np.zeros((n, 2)))
+    return HeadMotion(zero, zero, zero, np.zeros((n, 2)))
 
 
 def rest_log(imu: Imu, duration_s: float, seed: int, source: str = "log.csv") -> tuple[Readings, np.ndarray]:
