@@ -280,13 +280,11 @@ class Simulated:
 
 
 class Process:
-    """A program that gets one tick at a time."""
+    """A program on this machine that gets one tick at a time."""
 
     def __init__(self, command: Sequence[str]) -> None:
-        self.on_avr = len(command) > 1
-        arguments = list(command) if self.on_avr else [*command, "flush"]
         self.process = subprocess.Popen(
-            arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            [*command, "flush"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
 
     def send(self, given: Inputs) -> None:
@@ -298,7 +296,7 @@ class Process:
     def receive(self) -> Ticks:
         """Wait for its end."""
         assert self.process.stdout is not None
-        return _unpacked(self.process.stdout.read(72 if self.on_avr else 54), self.on_avr)
+        return _unpacked(self.process.stdout.read(54), False)
 
     def close(self) -> None:
         """End the program."""

@@ -19,16 +19,11 @@ __all__ = ["header", "rig"]
 
 
 def _camera(**more: Any) -> dict[str, Any]:
-    c = CAMERA
     names = ("fx_px", "fy_px", "skew_px", "cx_px", "cy_px")
-    section: dict[str, Any] = {name: float(getattr(c, name)) for name in names}
-    lens = {"k1": float(c.distortion[0]), "k2": float(c.distortion[1])}
-    section |= {
-        "model": "radial2",
-        "image_size_px": list(c.image_size_px),
-        "distortion": lens,
-        "verdict": "ok",
-    }
+    k1, k2 = CAMERA.distortion[:2].tolist()
+    section: dict[str, Any] = {name: float(getattr(CAMERA, name)) for name in names}
+    section |= {"model": "radial2", "image_size_px": list(CAMERA.image_size_px)}
+    section |= {"distortion": {"k1": k1, "k2": k2}, "verdict": "ok"}
     return section | more
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import firmware_rigs
 import numpy as np
 from open_loop import simulate
 
@@ -17,7 +19,6 @@ from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import TICK_S, Creep
 from calib.stages.actuator.pump import RateLimit
 from calib.stages.actuator.simulate import rig_at_rest
-from calib.stages.camera.section import Camera, Distortion, Plane
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.simulate import log_of
@@ -118,28 +119,7 @@ def varied(seed: int) -> tuple[SimulatedRig, dict[str, float]]:
 
 def rig_file(path: Path, **sections: Any) -> Rig:
     """A rig.yaml with the simulated rig's camera and plane."""
-    view = SimulatedRig().view
-    R, t, K = view.R_CW, view.t_CW_m, view.camera.K
-    A = K @ np.column_stack([R[:, 0], R[:, 1], t])
-    k1, k2 = view.camera.distortion[:2].tolist()
-    names = ("fx_px", "fy_px", "skew_px", "cx_px", "cy_px")
-    camera = Camera(
-        model="radial2",
-        image_size_px=list(view.camera.image_size_px),
-        distortion=Distortion(k1=k1, k2=k2),
-        verdict="ok",
-        **{name: float(getattr(view.camera, name)) for name in names},
-    )
-    plane = Plane(
-        R_CW=R.tolist(),
-        t_CW_m=t.tolist(),
-        A_px_per_m=A.tolist(),
-        A_inverse=np.linalg.inv(A).tolist(),
-        rms_px=0.0,
-        rms_mm=0.0,
-        verdict="ok",
-    )
-    rig = Rig(camera=camera, plane=plane, **sections)
+    rig = copy.deepcopy(firmware_rigs.rig()).with_sections(sections)
     rig.save(path)
     return rig
 

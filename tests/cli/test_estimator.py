@@ -475,18 +475,8 @@ def test_names_of_several_logs_stay_in_the_folder(
 
 
 @pytest.fixture
-def ellipse(tmp_path: Path) -> Path:
-    path = tmp_path / "ellipse.csv"
-    log = simulated("ellipse", 0)[1]
-    rows = log.t_s < 6.0
-    cut = {name: values[rows] for name, values in log.columns.items()}
-    write_log(path, replace(log, t_s=log.t_s[rows], columns=cut, lines=log.lines[rows]))
-    return path
-
-
-def weights(path: Path) -> np.ndarray:
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    return np.asarray(table["driven_weight"])
+def ellipse(log_file: Callable[..., Path]) -> Path:
+    return log_file("ellipse", change=lambda log: _first(log, int((log.t_s < 6.0).sum())))
 
 
 def test_commands_are_used_where_the_log_has_them(calib: Run, rig: Path, ellipse: Path) -> None:
@@ -498,23 +488,20 @@ def test_commands_are_used_where_the_log_has_them(calib: Run, rig: Path, ellipse
         found[model] = document["rmse"]["mean_q_mm"]
         if model == "kinematic":
             assert document["driven_share"] is None
-            assert np.isnan(weights(states)).all()
+            assert np.isnan(read_states(states)["driven_weight"]).all()
         elif model == "auto":
             assert 0.3 < document["driven_share"] <= 1.0
-            assert (weights(states) > 0.5).mean() > 0.3
+            assert (read_states(states)["driven_weight"] > 0.5).mean() > 0.3
     assert found["auto"] < found["kinematic"]
     assert found["driven"] < found["kinematic"]
 
 
-def test_the_driven_model_wants_commands(calib: Run, rig: Path, tmp_path: Path) -> None:
-    log = simulated("swing", 0)[1]
-    columns = {name: values for name, values in log.columns.items() if not name.startswith("pwm")}
-    path = tmp_path / "swing.csv"
-    write_log(path, replace(log, columns=columns))
-    refused = calib("replay", str(path), "--rig", str(rig), "--model", "driven")
+def test_the_driven_model_wants_commands(calib: Run, rig: Path, log_file: Callable[..., Path]) -> None:
+    path = log_file("swing", change=without("pwm1", "pwm2"))
+    refused = calib("replay", path, "--rig", rig, "--model", "driven")
     assert refused.code == 3
     assert "commands" in refused.err
-    assert calib("replay", str(path), "--rig", str(rig), "--json").code in (0, 1)
+    assert calib("replay", path, "--rig", rig, "--json").code in (0, 1)
 
 
 def test_a_plant_that_cannot_be_is_named(calib: Run, rig: Path, ellipse: Path) -> None:
@@ -548,7 +535,7 @@ def test_the_place_of_the_tip_stands_in_for_pictures(
     assert set(told["sensors"]) == {"pose", "accel", "gyro"}
     assert told["jitter_px"] is None
     assert told["pose_noise_mm"] == pytest.approx(0.3, rel=0.2)
-    q = np.genfromtxt(states, delimiter=",", names=True)
+    q = read_states(states)
     late = q["t_s"] > 2.0
     for name in ("q1_m", "q2_m"):
         error = (q[name] - log.columns[f"true_{name}"])[late]

@@ -21,7 +21,10 @@ from calib.core.rig import Rig
 from calib.runner.doctor import Check
 
 VERBS = ("intrinsics", "extrinsics", "distortion", "firmware", "board", "export", "import")
-HEAVY = ("numpy", "scipy", "cv2", "matplotlib", "numba", "filterpy", "pydantic", "yaml", "jinja2", "rich")
+HEAVY = (
+    "numpy", "scipy", "cv2", "matplotlib", "numba", "filterpy", "pydantic", "yaml", "jinja2", "rich",
+    "webbrowser", "markdown_it",
+)  # fmt: skip
 
 
 def test_help_imports_nothing_heavy(environment) -> None:

@@ -527,10 +527,3 @@ def test_docs_prints_lists_and_refuses(capsys: pytest.CaptureFixture[str], tmp_p
         page_of("tutorail", manual())
     with pytest.raises(UsageError, match="--list"):
         docs(topic="zzz")
-
-
-def test_help_of_docs_names_no_browser_it_would_load() -> None:
-    """The verb loads neither browser nor Markdown before it needs them."""
-    code = "import sys, calib.cli.app; print([m for m in ('webbrowser', 'markdown_it') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
