@@ -526,6 +526,8 @@ def test_units_that_no_arm_has_are_told() -> None:
         except BadInputError as error:
             said = [str(error)]
         assert any(words in text for text in said)
+    assert "as psi would" not in _said(columns, trial)
+    assert "as psi would" in _said(columns | {"p1_kpa": columns["p1_kpa"] / 6.895}, trial)
 
 
 def test_pressures_from_vacuum_are_told() -> None:

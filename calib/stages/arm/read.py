@@ -41,6 +41,8 @@ _LONGEST_M, _MOST_KPA, _LEAST_KPA, _MOST_TURN_RAD = 3.0, 2000.0, 5.0, 2.0 * math
 """No soft arm is so long, takes so much or rolls up twice; hardly one bends by so little a pressure."""
 _AIR_KPA = (80.0, 110.0)
 """Pressure of the air, from 2000 m above the sea down to it, with what a vented chamber is off."""
+_PSI = (0.08, 0.17)
+"""Greatest pressure in psi over the greatest command: valves of a real arm reach .66 to .85 of it in kPa."""
 _LEANS = (0.1, 1.0)
 """Turn of the chord over the tip's: a half of an arc, more with a stiff end, less with a stiff beginning."""
 _JUMP_SHARE = 0.03
@@ -307,7 +309,7 @@ def _in_units(recording: Recording) -> list[Finding]:
     if most > _MOST_KPA:
         raise BadInputError(
             f"{source}: pressures reach {most:.4g} kPa, expected at most {_MOST_KPA:g}; columns.yaml takes "
-            "Pa, each column with factor: 0.001"
+            "Pa, each column with factor: 0.001, and hPa or mbar with factor: 0.1"
         )
     if recording.command is not None and recording.pressure is not None:
         (asked, greatest), (least, most) = (
@@ -321,6 +323,12 @@ def _in_units(recording: Recording) -> list[Finding]:
             )
             advice = "columns.yaml takes off the air's from such a column with offset: 101.3"
             return [Finding("poor", text, advice)]
+        if _PSI[0] * greatest < most < _PSI[1] * greatest:
+            text = (
+                f"{recording.name}: its pressure is {most:.3g} kPa at most, where the command goes up to "
+                f"{greatest:.3g} kPa, as psi would"
+            )
+            return [Finding("poor", text, "columns.yaml takes psi with factor: 6.895")]
     if 0.0 < most < _LEAST_KPA:
         text = f"{recording.name}: pressures reach {most:.3g} kPa at most, as bar would"
         return [Finding("poor", text, "look for their unit; columns.yaml takes bar with factor: 100")]
