@@ -2084,7 +2084,10 @@ def _apart(solution: Solution, known: Uncertainty) -> Iterator[Finding]:
                 f"{label_of(name)} is {before} beforehand, and {after} by the fit: another rig's number, or "
                 "a fit that ended beside the rig"
             )
-            advice = "measure it and the mass again; where they are right, identify with some logs left out"
+            advice = (
+                "measure it and the mass again, and look at the stated gravity; where they are right, "
+                "identify with some logs left out"
+            )
             yield Finding("inconsistent", text, advice)
     moved, slow = moved_camera(solution), _slowly_commanded(solution.problem)
     if (
