@@ -114,9 +114,8 @@ def shell(environment: dict[str, str]) -> Shell:
     """Runs a script of bash in a folder, in which `calib` is the command."""
 
     def run(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
-        command = f'calib() {{ {shlex.join(COMMAND)} "$@"; }}\n'
         return subprocess.run(
-            ["bash", "-c", command + script],
+            ["bash", "-c", script.replace("calib ", f"{shlex.join(COMMAND)} ")],
             cwd=folder,
             env=environment,
             capture_output=True,
