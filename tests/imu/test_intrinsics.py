@@ -479,6 +479,17 @@ def test_six_poses_do_not_blame_the_unit_of_the_gyroscope() -> None:
     assert not any("--gyro-unit" in advice for advice in found.advice)
 
 
+def test_rests_hardly_more_than_parameters_tell_less_than_their_sigma(good: Readings) -> None:
+    result = find_intrinsics(good, G)
+    assert result.accel is not None
+    sigma = np.repeat([1e-3, 1e-3, 3e-3], 3)
+    few, many = (replace(result, accel=replace(result.accel, sigma=sigma, dof=dof)) for dof in (1, 12))
+    assert judge_intrinsics(many).word == "ok"
+    found = judge_intrinsics(few)
+    assert found.word == "poor"
+    assert "misalignment zx: known to 0.019 rad only, by 24 rests for 23 parameters" in found.reasons[-1]
+
+
 def test_a_cap_of_the_sphere_is_unidentifiable() -> None:
     poses = [pose for pose in sphere_poses(90) if _up(pose)[2] > 0.8]
     found = _judge(pose_log(poses, SENSOR))

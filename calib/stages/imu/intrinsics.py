@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import fdtrc, stdtrit
 
 from calib.core.arrays import BoolArray, FloatArray, IntArray
 from calib.core.compilation import kernel
@@ -1052,7 +1052,7 @@ def _names(d: int) -> list[str]:
 
 
 def _loose(
-    sensor: str, names: Sequence[str], sigma: FloatArray, limits: FloatArray, planar: bool
+    sensor: str, names: Sequence[str], sigma: FloatArray, limits: FloatArray, planar: bool, by: str = ""
 ) -> Iterator[Finding]:
     """Findings on parameters that are known less well than their limits: g, shares and rad."""
     for name, one, limit in zip(names, sigma.tolist(), limits.tolist(), strict=True):
@@ -1061,7 +1061,7 @@ def _loose(
             shown = f"{one:.2%}" if kind == "scale" else f"{one:.2g} {'g' if kind == 'bias' else 'rad'}"
             yield Finding(
                 "unidentifiable" if one > _USELESS * limit else "poor",
-                f"{sensor}, {name}: known to {shown} only",
+                f"{sensor}, {name}: known to {shown} only{by}",
                 protocol(planar),
             )
 
@@ -1085,7 +1085,10 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Find
     k = len(accel.angles)
     size = np.concatenate([g * accel.scale, accel.scale, np.ones(k)])
     limits = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, k])
-    yield from _loose("accelerometer", names, accel.sigma / size, limits, result.planar)
+    # Few rests more than parameters hardly tell how far they scatter: with one, 95 % lie within 12.7 sigma.
+    spread = float(stdtrit(accel.dof, 0.975)) / 1.96 if accel.dof > 0 else 1.0
+    by = f", by {len(result.rests)} rests for {len(result.rests) - accel.dof} parameters" * (spread > 1.5)
+    yield from _loose("accelerometer", names, spread * accel.sigma / size, limits, result.planar, by)
     if g == GRAVITY_MPS2 and float((accel.sigma[d : 2 * d] / accel.scale).max()) < _GRAVITY_SHARE:
         yield Finding(
             "remark",
