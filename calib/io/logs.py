@@ -608,7 +608,7 @@ _CHECK_IMU = "check the IMU's wiring and the bus that reads it"
 _HELD_S, _HELD_CHANCE, _OTHERS_REPEAT = 1.0, 1e-12, 0.5
 """Readings of a whole IMU that are the same for so long, and how likely that is by their steps alone; of one
 axis, and the most that other axes of the sensor repeat theirs meanwhile."""
-_BIN_S, _BINS = 0.5, 10
+_BIN_S, _BINS, _DEAD = 0.5, 10, 3
 _UPRIGHT, _LEAST_MPS2 = 0.75, 3.0
 _FELT_RAD, _ANSWERED = 0.03, 0.1
 """2 degrees, RMS: for half a second 0.03 g, of which a gyroscope that works shows more than a tenth."""
@@ -894,7 +894,7 @@ def _unmoved(log: Log) -> Finding | None:
         return None
     t_s = np.maximum.accumulate(log.t_s[rows])
     gz, ax, ay = (log.columns[name][rows] for name in IN_PLANE)
-    felt, rate, across = np.unwrap(np.arctan2(ay, ax)), -gz, ax * ax + ay * ay
+    leant, rate, across = np.unwrap(np.arctan2(ay, ax)), -gz, ax * ax + ay * ay
     upright = across > _LEAST_MPS2**2
     if tilts:
         gx, gy, az = (log.columns[name][rows] for name in ("gx_radps", "gy_radps", "az_mps2"))
@@ -905,7 +905,7 @@ def _unmoved(log: Log) -> Finding | None:
     long = np.flatnonzero(np.diff(edges) >= _FEWEST)
     for a, b in zip(edges[long].tolist(), edges[long + 1].tolist(), strict=True):
         lasting = t_s[b - 1] - t_s[a] >= _STUCK_S and upright[a:b].mean() > 0.9
-        if lasting and float(felt[a:b].std()) > _SHAKEN_RAD:
+        if lasting and float(leant[a:b].std()) > _SHAKEN_RAD:
             return Finding(
                 "inconsistent",
                 f"gz_radps is stuck at {gz[a]:.6g} from {t_s[a]:.1f} to {t_s[b - 1]:.1f} s, where the "
@@ -916,7 +916,7 @@ def _unmoved(log: Log) -> Finding | None:
     size = np.diff(np.append(starts, len(t_s)))
     if len(starts) < _BINS:
         return None
-    bins = np.stack([np.add.reduceat(x, starts) / size for x in (t_s, felt, turned, upright)])
+    bins = np.stack([np.add.reduceat(x, starts) / size for x in (t_s, leant, turned, upright)])
     windows = np.lib.stride_tricks.sliding_window_view(bins, _BINS, axis=1).transpose(1, 0, 2)
     t, angles, flat = windows[:, 0], windows[:, 1:3], windows[:, 3].min(axis=1) > 0.9
     flat &= t[:, -1] - t[:, 0] < 2.0 * _BINS * _BIN_S
@@ -926,14 +926,13 @@ def _unmoved(log: Log) -> Finding | None:
     angles = angles - slope[:, :, None] * k[:, None, :]
     felt_rad, turned_rad = angles.std(axis=2).T
     carried_mps = GRAVITY_MPS2 * _BIN_S * np.cumsum(angles[:, 0], axis=1).std(axis=1)
-    dead = np.flatnonzero(
-        flat
-        & (felt_rad > _FELT_RAD)
-        & (turned_rad < _ANSWERED * felt_rad)
-        & (carried_mps > _CARRIED_MPS)
-        & (np.abs(slope[:, 1]) < _MOST_BIAS_RADPS)
-    )
-    if len(dead) == 0:
+    felt, answered = flat & (felt_rad > _FELT_RAD), turned_rad >= _ANSWERED * felt_rad
+    still = (carried_mps > _CARRIED_MPS) & (np.abs(slope[:, 1]) < _MOST_BIAS_RADPS)
+    dead = np.flatnonzero(felt & ~answered & still)
+    # In hours of handling some push looks like a turn: in few windows, or between turns that are answered.
+    if len(dead) < min(_DEAD, len(felt)):
+        return None
+    if np.count_nonzero((felt & answered)[dead[0] : dead[-1]]) > len(dead):
         return None
     most = dead[np.argmax(felt_rad[dead])]
     return Finding(

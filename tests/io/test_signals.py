@@ -103,6 +103,7 @@ def test_a_gyroscope_that_does_not_answer_is_named() -> None:
         (np.where(t > 20.0, gz[2000], gz), "gz_radps is stuck at"),
         (noise, "gz_radps does not turn from 0.0 s on"),
         (np.where(t > 20.0, noise, gz), "gz_radps does not turn from 20.0 s on"),
+        (np.where(abs(t - 15.0) < 4.0, noise, gz), "gz_radps does not turn from 10.5 s on"),
         (0.05 * gz, "gz_radps does not turn from 0.0 s on"),
     ):
         with pytest.raises(BadInputError, match=words):
@@ -116,6 +117,11 @@ def test_a_gyroscope_that_does_not_answer_is_named() -> None:
     # A slide goes to and fro by 0.2 m/s without turning.
     slid = _log(gz_radps=noise, ax_mps2=G, ay_mps2=0.2 * 2.5 * np.sqrt(2.0) * np.cos(2.5 * t))
     assert slid.signals(*IN_PLANE).findings == ()
+    # Between two quick turns somebody pushes it.
+    lean = 0.25 * (np.tanh((t - 8.0) / 0.1) + np.tanh((t - 13.9) / 0.1))
+    force = G * np.exp(1j * lean) + 2.5j * (abs(t - 10.8) < 0.4)
+    pushed = _log(gz_radps=noise - np.gradient(lean, t), ax_mps2=force.real, ay_mps2=force.imag)
+    assert pushed.signals(*IN_PLANE).findings == ()
     # At 200 deg/s a lever of half a metre is felt by 0.6 g, and the rate stays the same.
     force = G * np.exp(3.5j * t) - 0.5 * 3.5**2
     turning = _log(gz_radps=noise - 3.5, ax_mps2=force.real, ay_mps2=force.imag)
