@@ -32,6 +32,7 @@ from calib.stages.actuator.identify_pump import (
     identify_pump,
     judge_pump,
     jumps,
+    of_lag,
     pump_section,
     settled_groups,
     simulate_pump,
@@ -40,6 +41,7 @@ from calib.stages.actuator.identify_pump import (
 )
 from calib.stages.actuator.pump import Orifice
 from calib.stages.actuator.read import read_pump_table
+from calib.stages.actuator.section import PumpModel
 
 
 @pytest.mark.parametrize(
@@ -259,6 +261,13 @@ def test_a_pump_that_is_a_lag_is_found_to_be_one(found: PumpFound) -> None:
     static = section.identified.static["static"]
     assert static.dead_pwm == pytest.approx(90.0, abs=4.0)
     assert set(section.identified.models) == {LAG, ORIFICE}
+
+
+def test_a_lag_that_a_file_gives_without_deviations_has_none() -> None:
+    model = PumpModel(parameters={"lag_s": 0.5, "dead_time_s": 0.06}, sigma={}, fitted_rms=0.1)
+    values, sigma = of_lag(model, 0.015)
+    assert values == {"lag_s": 0.5, "delay_ticks": 4}
+    assert sigma == {"lag_s": None, "delay_ticks": None}
 
 
 @pytest.mark.slow

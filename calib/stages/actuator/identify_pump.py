@@ -1243,11 +1243,11 @@ def _model(found: PumpFound, name: str) -> PumpModel:
 def of_lag(model: PumpModel, tick_s: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """Lag and dead time of the linear model by their keys of the section, and their standard deviations."""
     value, sigma = model.parameters, model.sigma
-    late_s = sigma["dead_time_s"]
+    late_s = sigma.get("dead_time_s")
     late = None if late_s is None else late_s / tick_s
     return (
         {"lag_s": value["lag_s"], "delay_ticks": round(value["dead_time_s"] / tick_s)},
-        {"lag_s": sigma["lag_s"], "delay_ticks": late},
+        {"lag_s": sigma.get("lag_s"), "delay_ticks": late},
     )
 
 
