@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from open_loop import simulate
 
 from calib.core.errors import BadInputError
+from calib.core.rig import Rig
 from calib.stages.actuator.kinematics import angle, forward
 from calib.stages.control.laws import Model, feed_forward_pwm
-from calib.stages.control.read import read_reference
+from calib.stages.control.read import read_reference, recorded_reference
 from calib.stages.control.references import (
     BUILT_IN,
     Ellipse,
@@ -27,6 +28,7 @@ from calib.stages.control.references import (
     resampled,
 )
 from calib.stages.control.tuning import follow, largest_angle, longest_m, reachable, slowed
+from calib.stages.estimator import replay
 
 H = NOMINAL.tick_s
 BOX = (-0.06, 0.04, 0.06, 0.11)
@@ -182,6 +184,15 @@ def test_a_recorded_log_is_a_reference(make: Make) -> None:
     q = 0.07 + 0.003 * np.sin(t)
     made = read_reference(make(_table("t_s,u_px,true_q1_m,true_q2_m", t, t, q, q)), NOMINAL)
     assert made.q_m[:, 0] == pytest.approx(0.07 + 0.003 * np.sin(made.t_s), abs=1e-6)
+
+
+def test_a_recorded_log_whose_time_goes_back_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = np.zeros((4, 3))
+    rows[:, 0] = 0.0, 2.0, 0.5, 1.0
+    monkeypatch.setattr(replay, "opened", lambda *asked: None)
+    monkeypatch.setattr(replay, "smoothed_rows", lambda *asked: rows)
+    with pytest.raises(BadInputError, match=r"log\.csv: time goes back from 2\.000 to 1\.000 s, expected"):
+        recorded_reference(Path("log.csv"), Rig(), Path("rig.yaml"), NOMINAL)
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,11 @@ def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> re
     rows = smoothed_rows(opened(path, rig, rig_path), math.inf)
     rows = rows[np.isfinite(rows[:, :3]).all(axis=1)]
     rows = rows[np.concatenate([[True], np.diff(rows[:, 0]) > 0.0])] if len(rows) else rows
+    for k in np.flatnonzero(np.diff(rows[:, 0]) <= 0.0).tolist():
+        before_s, then_s = rows[k : k + 2, 0].tolist()
+        raise BadInputError(
+            f"{shown(path)}: time goes back from {before_s:.3f} to {then_s:.3f} s, expected rising times"
+        )
     if len(rows) < _FEWEST:
         raise BadInputError(f"{shown(path)}: shows no lengths to follow, expected camera and IMU in motion")
     return references.from_lengths(
