@@ -71,7 +71,8 @@ def convert(
             if len(again) and not back:
                 k = again[0]
                 first_back = f"line {block.lines[k]}: the time goes back to {block.t_s[k]:g} s"
-            back, before = back + len(again), block.t_s[-1]
+            # What was cut off may end a log by a block without rows.
+            back, before = back + len(again), block.t_s[-1] if len(block) else before
             progress(rows, 0)
     if save_columns is not None and read_as is not None:
         write_atomically(save_columns, read_as.text(), COLUMNS_FILE)
