@@ -160,7 +160,7 @@ def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
             parse_options=arrow_csv.ParseOptions(delimiter=text.separator, ignore_empty_lines=False),
             convert_options=arrow_csv.ConvertOptions(
                 column_types=kinds,
-                include_columns=list(wanted.values()),
+                include_columns=list(kinds),
                 null_values=list(_BLANK),
                 decimal_point=text.decimal,
             ),

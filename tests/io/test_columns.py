@@ -197,6 +197,9 @@ def test_a_file_without_a_header(tmp_path: Path) -> None:
     text = "t_s: {column: 1, unit: ms}\nax_mps2: 2\nay_mps2: 3\ngz_radps: 4\n"
     (tmp_path / "columns.yaml").write_text(text)
     numbered = read_log(path)
+    (tmp_path / "columns.yaml").write_text(text + "gy_radps: 4\n")
+    shared = read_log(path).columns
+    assert np.array_equal(shared["gy_radps"], shared["gz_radps"])
     (tmp_path / "columns.yaml").unlink()
     above = read_log(_written(path, [], columns, head="#millis,ax,ay,gz"))
     for log in (named, numbered, above):
