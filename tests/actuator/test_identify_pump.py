@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from identifytrials import FLOW_TRUTH, LAG_TRUTH, pump_records
 from outside import outside
+from pydantic import ValidationError
 
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.actuator.identify_pump import (
-    LAG,
     MODELS,
-    ORIFICE,
     PumpFit,
     PumpFound,
     PumpRecord,
@@ -41,7 +40,7 @@ from calib.stages.actuator.identify_pump import (
 )
 from calib.stages.actuator.pump import Orifice
 from calib.stages.actuator.read import read_pump_table
-from calib.stages.actuator.section import PumpModel
+from calib.stages.actuator.section import LAG, ORIFICE, PumpIdentified, PumpModel
 
 
 @pytest.mark.parametrize(
@@ -268,6 +267,9 @@ def test_a_lag_that_a_file_gives_without_deviations_has_none() -> None:
     values, sigma = of_lag(model, 0.015)
     assert values == {"lag_s": 0.5, "delay_ticks": 4}
     assert sigma == {"lag_s": None, "delay_ticks": None}
+    without = model.model_copy(update={"parameters": {"lag_s": 0.5}})
+    with pytest.raises(ValidationError, match="linear lag lack one of lag_s and dead_time_s"):
+        PumpIdentified(unit="kPa", models={LAG: without})
 
 
 @pytest.mark.slow

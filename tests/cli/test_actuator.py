@@ -19,8 +19,7 @@ from calib.core.options import PoseOptions
 from calib.core.rig import Rig
 from calib.core.stage import Files
 from calib.io.logs import read_log
-from calib.stages.actuator.identify_pump import LAG
-from calib.stages.actuator.section import Known, KnownActuator, KnownPump
+from calib.stages.actuator.section import LAG, Known, KnownActuator, KnownPump
 from calib.stages.actuator.validate import IMPROVED, ORIGINAL, begun_track, compare, models_of
 from calib.twin.rig import SimulatedRig
 

@@ -22,6 +22,9 @@ from calib.stages.actuator.identify import Progress
 from calib.stages.actuator.parameters import SUPPLY_V, TICK_S
 from calib.stages.actuator.pump import PWM_MAX
 from calib.stages.actuator.section import (
+    LAG,
+    OF_LAG,
+    ORIFICE,
     KnownPump,
     PumpIdentified,
     PumpModel,
@@ -54,7 +57,6 @@ from calib.stages.actuator.section import (
 # exactly for the lag, by steps of Runge and Kutta for the flow, and is smooth in T_d: on a grid of its own,
 # whose steps get a command's mean, slopes jump in T_d, and a search ends at one of these kinks.
 
-LAG, ORIFICE = "linear lag", "orifice flow"
 STEP_S = 2e-3
 """Stable at the bounds of all parameters."""
 _DEAD_MOST_S = 0.5
@@ -1097,7 +1099,6 @@ _AS_GOOD = 1.25
 _MOST_VAGUE = 0.5
 _PASSAGE = ("laminar_s", "turbulent_s2", "hose_per_s", "chamber_s")
 """What may be vague: parts of the passage make up for each other."""
-_WRITTEN = ("lag_s", "dead_time_s")
 _SETTLED = 0.95
 """Runs of a pump behind an orifice that end there have a lag a seventh longer than settled ones."""
 
@@ -1192,7 +1193,7 @@ def _of_better(found: PumpFound) -> Iterator[Finding]:
         # zero is known well enough where it moves the rise by little.
         enough = _MOST_SHARE * found.fits[LAG].values["lag_s"] if name == "dead_time_s" else 0.0
         vague = sigma > max(_MOST_VAGUE * value, enough)
-        if name not in _PASSAGE and vague and (model == better or name in _WRITTEN):
+        if name not in _PASSAGE and vague and (model == better or name in OF_LAG):
             known = f"known to {100.0 * sigma / value:.0f} % only" if sigma < value else "not told by these"
             yield Finding(
                 "poor",

@@ -9,9 +9,9 @@ import numpy as np
 from calib.core import plot
 from calib.core.arrays import FloatArray, rms
 from calib.stages.actuator.identify import autocorrelation
-from calib.stages.actuator.identify_pump import LAG, ORIFICE, PumpFound
+from calib.stages.actuator.identify_pump import PumpFound
 from calib.stages.actuator.results import Identified, simulated_heads
-from calib.stages.actuator.section import Actuator, PumpSection, label_of
+from calib.stages.actuator.section import LAG, ORIFICE, Actuator, PumpSection, label_of
 from calib.stages.actuator.stage import Springs, Validated
 from calib.stages.actuator.validate import CALLED, IMPROVED, NOMINAL, ORIGINAL, QUANTITIES, Comparison
 

@@ -38,10 +38,20 @@ from calib.stages.actuator.identify import (
     uncertainty,
     values_of,
 )
-from calib.stages.actuator.identify_pump import LAG, of_lag
+from calib.stages.actuator.identify_pump import of_lag
 from calib.stages.actuator.machine import Machine, machine_from
 from calib.stages.actuator.parameters import Stiffness
-from calib.stages.actuator.section import CREEP, KNOTS, LAW, STRENGTHS, Actuator, Known, PumpSection, in_force
+from calib.stages.actuator.section import (
+    CREEP,
+    KNOTS,
+    LAG,
+    LAW,
+    STRENGTHS,
+    Actuator,
+    Known,
+    PumpSection,
+    in_force,
+)
 
 
 @dataclass(frozen=True)

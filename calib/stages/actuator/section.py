@@ -191,6 +191,12 @@ class SettledRuns(Section):
     files: list[str]
 
 
+LAG, ORIFICE = "linear lag", "orifice flow"
+"""Models of a pump in a table."""
+OF_LAG = ("lag_s", "dead_time_s")
+"""Parameters of the former that become those of the section."""
+
+
 class PumpIdentified(Section):
     """What `calib identify pump` finds, in the unit of its tables.
 
@@ -205,6 +211,13 @@ class PumpIdentified(Section):
     static: dict[str, StaticMapSection] = {}
     groups: list[SettledRuns] = []
     unexplained: list[str] = []
+
+    @field_validator("models")
+    @classmethod
+    def _lag(cls, models: dict[str, PumpModel]) -> dict[str, PumpModel]:
+        if LAG in models and not {*OF_LAG} <= {*models[LAG].parameters}:
+            raise ValueError(f"the parameters of {LAG} lack one of {' and '.join(OF_LAG)}")
+        return models
 
 
 class PumpSection(PumpParameters, Result):
