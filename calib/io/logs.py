@@ -127,7 +127,7 @@ class Log(InWords):
         if not names or any(name not in self.columns for name in names):
             return np.zeros(0, dtype=np.int64)
         of = np.logical_or if partly else np.logical_and
-        return np.nonzero(of.reduce([~np.isnan(self.columns[name]) for name in names]))[0]
+        return np.nonzero(of.reduce([np.isfinite(self.columns[name]) for name in names]))[0]
 
     @property
     def beginning(self) -> dict[str, FloatArray]:

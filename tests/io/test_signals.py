@@ -40,6 +40,9 @@ def test_rows_with_all_columns() -> None:
     assert both.axis.rate_hz == pytest.approx(100.0 / 3.0)
     either = log.signals("u_px", optional=("gz_radps", "gx_radps"), partly=True)
     assert (len(either), either.names) == (3000, ("u_px", "gz_radps"))
+    # What is infinite is no reading, in a log made in Python as in one that was read.
+    wild = _log(gz_radps=np.where(np.arange(3000) < 7, np.inf, 0.1 * np.arange(3000)))
+    assert [len(wild.signals("gz_radps", partly=some)) for some in (False, True)] == [2993, 2993]
 
 
 def test_an_accelerometer_with_rows_of_its_own_is_read_between_them() -> None:
