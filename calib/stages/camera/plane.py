@@ -198,7 +198,7 @@ def compare_pictures(
     for view, residuals in _by_view(views, pose.residuals_px):
         moved, squared = np.nan, np.sum(residuals**2, axis=1)
         with suppress(BadInputError):
-            own = fit_pose(camera, view.target_m, view.pixels)
+            own = fit_pose(camera, view.target_m, view.pixels) if len(views) > 1 else pose
             tested.append((float(squared.sum()), own.cost_px2, 2 * len(squared) - 6))
             moved = float(np.sqrt(np.mean(np.sum((own.residuals_px - residuals) ** 2, axis=1))))
         fits.append(PictureFit(view.name, len(squared), float(np.sqrt(np.mean(squared))), moved))

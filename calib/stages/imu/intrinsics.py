@@ -1087,7 +1087,8 @@ def _of_accelerometer(result: Intrinsics, accel: Accelerometer) -> Iterator[Find
     limits = np.repeat([LIMITS["bias_g"], LIMITS["scale"], LIMITS["angle_rad"]], [d, d, k])
     # Few rests more than parameters hardly tell how far they scatter: with one, 95 % lie within 12.7 sigma.
     spread = float(stdtrit(accel.dof, 0.975)) / 1.96 if accel.dof > 0 else 1.0
-    by = f", by {len(result.rests)} rests for {len(result.rests) - accel.dof} parameters" * (spread > 1.5)
+    n = len(result.rests)
+    by = f", by {n} rests for {n - accel.dof} parameters" if spread > 1.5 else ""
     yield from _loose("accelerometer", names, spread * accel.sigma / size, limits, result.planar, by)
     if g == GRAVITY_MPS2 and float((accel.sigma[d : 2 * d] / accel.scale).max()) < _GRAVITY_SHARE:
         yield Finding(
