@@ -16,9 +16,9 @@ from calib.core.rig import Rig
 from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.io.logs import Log
-from calib.stages.actuator.identify import decrement
 from calib.stages.actuator.kinematics import angle
 from calib.stages.actuator.simulate import RigState, rig_at_rest
+from calib.stages.actuator.swing import decrement
 from calib.stages.control.laws import (
     ANGLE_PIDS,
     LENGTHS_PD,

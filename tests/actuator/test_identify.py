@@ -18,10 +18,9 @@ from calib.core.rig import Rig
 from calib.core.stage import Files
 from calib.io.experiments import EXPERIMENTS
 from calib.io.logs import Log, read_log, write_log
-from calib.stages.actuator import identify
+from calib.stages.actuator import verdict
 from calib.stages.actuator.identify import (
     PARAMETERS,
-    Moved,
     Problem,
     Solution,
     Start,
@@ -29,27 +28,16 @@ from calib.stages.actuator.identify import (
     _coarse,
     _spread,
     _whole,
-    by_logs,
     colour_of,
-    crossed,
-    decrement,
     first_guess,
-    fit_stiffness,
     fit_tracks,
     head_of,
     heads_of,
-    held_back,
     jacobian,
-    judge,
     made,
-    moved_camera,
-    own_delays,
-    prospects,
-    pump_delay,
     residuals,
     solve,
     start_of,
-    uncertainty,
     values_of,
 )
 from calib.stages.actuator.identify_pump import Shape, fit_static_map
@@ -57,7 +45,11 @@ from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant
 from calib.stages.actuator.pump import Orifice, RateLimit
 from calib.stages.actuator.read import let_go, read_track, start_in_motion
+from calib.stages.actuator.springs import fit_stiffness
+from calib.stages.actuator.swing import decrement
+from calib.stages.actuator.uncertainty import held_back, prospects, uncertainty
 from calib.stages.actuator.validate import IMPROVED, ORIGINAL, compare
+from calib.stages.actuator.verdict import Moved, by_logs, crossed, judge, moved_camera, own_delays, pump_delay
 from calib.twin.rig import SimulatedRig
 
 TRUTH = {
@@ -294,7 +286,7 @@ def test_residuals_that_last_for_seconds_count_as_few(
     priors = np.zeros(len(solution.problem.unknowns.priors))
     lasting = replace(solution, residual=np.concatenate([*(one.ravel() for one in slow), priors]))
     raised = uncertainty(lasting).inflation
-    monkeypatch.setattr("calib.stages.actuator.identify._LONGEST_S", 0.0)
+    monkeypatch.setattr("calib.stages.actuator.uncertainty._LONGEST_S", 0.0)
     briefly = uncertainty(lasting).inflation
     assert all(raised[name] >= briefly[name] for name in raised)
     assert max(raised[name] / briefly[name] for name in raised) > 1.3
@@ -542,7 +534,7 @@ def test_a_move_that_a_fine_camera_alone_sees_is_none(
     x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
     found = Solution(problem, x, residual, J, cost, {}, 1, 1)
     moved = Moved("prbs", 1.0, phi_rad, length_m, readings=5.0, deviations=50.0)
-    monkeypatch.setattr(identify, "moved_camera", lambda _: moved)
+    monkeypatch.setattr(verdict, "moved_camera", lambda _: moved)
     assert judge(found, uncertainty(found), colour_of(found), [], []).word == word
 
 

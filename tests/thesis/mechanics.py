@@ -18,15 +18,7 @@ from source_model import PRINTED_CREEP, PolynomialForce, kinetic_energy_J, pose_
 from calib.core.arrays import FloatArray
 from calib.core.plot import Band, Plot
 from calib.stages.actuator.dynamics import coriolis_matrix, linearised, mass_matrix
-from calib.stages.actuator.identify import (
-    Solution,
-    StiffnessFit,
-    Track,
-    decrement,
-    fit_stiffness,
-    fit_tracks,
-    made,
-)
+from calib.stages.actuator.identify import Solution, Track, fit_tracks, made
 from calib.stages.actuator.kinematics import (
     chord_ratio,
     forward,
@@ -38,6 +30,8 @@ from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Plant, growth_rate_per_s
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce, static_force_N
 from calib.stages.actuator.simulate import STATE
+from calib.stages.actuator.springs import StiffnessFit, fit_stiffness
+from calib.stages.actuator.swing import decrement
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import at_rest, elongation_mm, fall_time_s, tick_times
 from calib.twin.sensors import normal, stream

@@ -1,9 +1,9 @@
-"""Parameters of the actuator from logs: fit, error bars, verdict, and the next experiment."""
+"""Parameters of the actuator from logs: what is estimated, residuals of simulated motion, and the search."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.core.arrays import BoolArray, FloatArray, IntArray, rms, robust_sigma
+from calib.core.arrays import FloatArray, IntArray, robust_sigma
 from calib.core.errors import BadInputError
-from calib.core.verdict import Finding, Verdict
-from calib.solve.information import scaled_inverse, tied_groups
+from calib.solve.information import scaled_inverse
 from calib.stages.actuator.kinematics import bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
@@ -354,8 +353,8 @@ FAR = 1e3
 """Residual of a row that a candidate cannot reach at all."""
 
 _OFFSET_SIGMA = (0.005, 0.0005)
-_DELAY_SIGMA_S = 0.03
-_STEP = 1e-4
+DELAY_SIGMA_S = 0.03
+STEP = 1e-4
 _START_STEP = (1e-4, 1e-5, 1e-3, *(1e-4,) * 7)
 _START_SCALE = (0.01, 0.001, 0.1, 0.005, 0.02, 0.02, *(0.05,) * 4)
 _START_REACH = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
@@ -443,7 +442,7 @@ class Problem:
             ]
             delays.append(before[0] if before else len(rows))
             if not before:
-                rows.append((0.01, self.delay_s - 0.5, self.delay_s + 0.5, self.delay_s, _DELAY_SIGMA_S))
+                rows.append((0.01, self.delay_s - 0.5, self.delay_s + 0.5, self.delay_s, DELAY_SIGMA_S))
         starts = []
         for track in self.tracks:
             at, moving = len(rows), track.moving is not None
@@ -492,7 +491,7 @@ def head_of(problem: Problem, x: FloatArray, k: int, track: Track | None = None)
     return np.asarray(head[0])
 
 
-def _whitened(track: Track, error: FloatArray) -> FloatArray:
+def whitened(track: Track, error: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mij,...mj->...mi", track.whitening, error))
 
 
@@ -518,7 +517,7 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
         if np.ptp(xs[:, delay]) > 0.0:
             head = head - rate * (xs[:, delay] - middle)[:, None, None]
         error = track.head - head - xs[:, None, unknowns.offset]
-        rows = _whitened(track, error).reshape(len(xs), -1)
+        rows = whitened(track, error).reshape(len(xs), -1)
         parts.append(np.where(np.isfinite(rows), rows, FAR))
     parts.append(np.stack([_priors(problem, x) for x in xs]))
     return np.concatenate(parts, axis=1)
@@ -527,7 +526,7 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
 def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals (rows,) and their derivatives (rows, size) at a vector of unknowns."""
     unknowns, P = problem.unknowns, len(problem.names)
-    steps = _STEP * np.maximum(np.abs(x[:P]), unknowns.scale[:P])
+    steps = STEP * np.maximum(np.abs(x[:P]), unknowns.scale[:P])
     up = np.minimum(x[:P] + steps, unknowns.high[:P])
     down = np.maximum(x[:P] - steps, unknowns.low[:P])
     start_steps = np.array(_START_STEP)
@@ -562,8 +561,8 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         J[:, :, :P] = slope[:, :, :P]
         J[:, :, unknowns.starts[k]] = slope[:, :, P:]
         J[:, :, unknowns.offset] = -W
-        J[:, :, delay] = _whitened(track, rate[0])
-        error = _whitened(track, track.head - head[0] - x[unknowns.offset])
+        J[:, :, delay] = whitened(track, rate[0])
+        error = whitened(track, track.head - head[0] - x[unknowns.offset])
         good = np.isfinite(error).all() and np.isfinite(J).all()
         blocks.append(J.reshape(-1, unknowns.size) if good else np.zeros((2 * len(track.t_s), unknowns.size)))
         errors.append(np.where(np.isfinite(error), error, FAR).reshape(-1))
@@ -653,7 +652,7 @@ class Solution:
         return scaled_inverse(self.weighted.T @ self.J)
 
 
-def _robust(problem: Problem, r: FloatArray) -> FloatArray:
+def robust_cost(problem: Problem, r: FloatArray) -> FloatArray:
     """Cost of residuals (..., rows): soft-L1, of the priors the square, which nothing outruns."""
     rows = r.shape[-1] - len(problem.unknowns.priors)
     readings = _SOFT**2 * np.sum(np.sqrt(1.0 + (r[..., :rows] / _SOFT) ** 2) - 1.0, axis=-1)
@@ -715,7 +714,7 @@ def solve(problem: Problem, x: FloatArray, most: int = 30, enough: float = -math
     def rows(at: FloatArray) -> FloatArray:
         nonlocal end
         residual, _, few, _ = all_of(at)
-        if _robust(problem, residual) < enough:
+        if robust_cost(problem, residual) < enough:
             end = at
             raise _Enough
         return few
@@ -737,7 +736,7 @@ def solve(problem: Problem, x: FloatArray, most: int = 30, enough: float = -math
         ).x
     end = np.array(end, dtype=np.float64)
     residual, J, _, _ = all_of(end)
-    return end, float(_robust(problem, residual)), residual, J
+    return end, float(robust_cost(problem, residual)), residual, J
 
 
 def informative(
@@ -753,10 +752,10 @@ def informative(
     A = J * np.sqrt(w)[:, None]
     A[:, :P] *= size
     kept = [*range(P), *shared]
-    return _eliminated(A.T @ A, kept, 1e-12)
+    return eliminated(A.T @ A, kept, 1e-12)
 
 
-def _eliminated(H: FloatArray, kept: list[int], floor: float) -> FloatArray:
+def eliminated(H: FloatArray, kept: list[int], floor: float) -> FloatArray:
     """Information about the unknowns that are kept, of that (n, n) about all."""
     gone = [k for k in range(len(H)) if k not in kept]
     own, mixed, rest = H[np.ix_(kept, kept)], H[np.ix_(kept, gone)], H[np.ix_(gone, gone)]
@@ -957,7 +956,7 @@ def _with_play(solution: Solution) -> Solution:
         rough = replace(problem, names=_ordered(names | {name}), held={}, rough=True)
         values = [{**base, name: width} for base in bases for width in widths]
         starts = np.array([_moved(solution, rough, one) for one in values])
-        best = int(np.argmin(_robust(rough, residuals(rough, starts))))
+        best = int(np.argmin(robust_cost(rough, residuals(rough, starts))))
         tried.append((solve(rough, starts[best], 25)[1], name, values[best]))
     cost, name, begin = min(tried, key=lambda one: one[0])
     if not cost < _BETTER * solution.cost:
@@ -1003,7 +1002,7 @@ def _again(
     coarse = _coarse(problem)
     found, *_ = solve(coarse, _moved(solution, coarse, values), 25)
     starts = np.array([_moved(solution, problem, values), _whole(problem, coarse, found)])
-    minimum = solve(problem, starts[int(np.argmin(_robust(problem, residuals(problem, starts))))], 40)
+    minimum = solve(problem, starts[int(np.argmin(robust_cost(problem, residuals(problem, starts))))], 40)
     told, (x, cost, residual, J) = _all_told(problem, minimum, why)
     return Solution(told, x, residual, J, cost, why, solution.agreeing, solution.starts, solution.law)
 
@@ -1022,7 +1021,7 @@ def _without_creep(solution: Solution) -> Solution:
     what stays of the creep bends stiffness and damping.
     """
     problem, rate, spring = solution.problem, "lambda1_per_s", "lambda2_N_per_m"
-    doubtful = {rate, spring} & {*solution.fixed} or any(label_of(rate) in one for one in _bounds(solution))
+    doubtful = {rate, spring} & {*solution.fixed} or any(label_of(rate) in one for one in at_bounds(solution))
     if not doubtful or {*CREEP} & {*problem.stated}:
         return solution
     known = values_of(problem.nominal)
@@ -1072,7 +1071,7 @@ def _search(
     """The best of several refined starts, how many agree with it, and of how many."""
     rough = _coarse(problem)
     spread = _spread(rough, known)
-    order = np.argsort(_robust(rough, residuals(rough, spread)), kind="stable")[:_REFINED].tolist()
+    order = np.argsort(robust_cost(rough, residuals(rough, spread)), kind="stable")[:_REFINED].tolist()
     if 0 not in order:
         order.append(0)
     best, costs, limit = spread[0], list[float](), math.inf
@@ -1095,54 +1094,11 @@ def _alike(cost: float) -> float:
 
 
 # ----------------------------------------------------------------------
-# What a fit is worth: standard deviations, correlation, whiteness of residuals, and a log held back.
-#
-# With weighted derivatives J and information H = J^T J of all unknowns, priors included, white residuals of
-# variance s^2 would give the covariance s^2 H^-1. Those of a camera with coarse pixels, and of a model that
-# is not quite right, are coloured. Then the sandwich
-#
-#     H^-1 (sum_k w_k sum_i g_i g_(i+k)^T) H^-1,   g_i the gradient of row i, w_k = 1 - |k| / (L + 1)
-#
-# (Newey and West) holds, with lags L of a third of a second or, where residuals stay alike for longer, up to
-# the first at which they do not. It scatters itself, so of it and the white one the larger variance is taken
-# for each parameter; their ratio says how far colour has inflated it.
-#
-# Both hold for a model that is right in the mean. One of another structure, as of a rig with dry friction or
-# hysteresis, fits each stretch of a log with other parameters. With the information H_s and the gradient g_s
-# of a stretch, parameter i of it alone is off by d = -g_s,i / h, h = (H_s - H_s H^-1 H_s)_ii, all others
-# following, with the variance 1 / h, raised as above. Where these scatter by more, their variance T_i
-# between stretches (DerSimonian and Laird) is added: that of another stretch, and that of the fit,
-#
-#     T + sum_s sum_i T_i (H^-1 H_s e_i) (H^-1 H_s e_i)^T.
+# What a solution leaves: whiteness of each log's residuals, and parameters at their bounds.
 
-_SPAN_S, _LONGEST_S = 0.35, 10.0
-_STRETCHES = 5
-"""Of each log: a swing that has died away within two thirds of its log is told in three."""
-_SCATTERS = 0.01
-"""Probability of such a scatter by chance, below which it is believed."""
 _LAGS = 20
-_BAND = 1.96
+BAND = 1.96
 """Of the correlation of white residuals, over the root of their number."""
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """Standard deviations and correlation of the estimated parameters.
-
-    Attributes
-    ----------
-    sigma : by name. covariance, correlation : (P, P).
-    inflation : by name, how much colour has raised it. scatter : by name, how much on top of that has what
-    stretches of the logs disagree on.
-    scale : robust standard deviation of the whitened residuals, 1 for a perfect model and noise.
-    """
-
-    sigma: dict[str, float]
-    inflation: dict[str, float]
-    scatter: dict[str, float]
-    covariance: FloatArray
-    correlation: FloatArray
-    scale: float
 
 
 @dataclass(frozen=True)
@@ -1166,22 +1122,6 @@ class Colour:
         return self.outside <= 0.15
 
 
-@dataclass(frozen=True)
-class HeldLog:
-    """RMS of angle [rad] and length [m] on a log, fitted and held back.
-
-    `chance` is the probability that the other logs fit this much worse with the parameters of all logs than
-    with their own, where one model makes them all.
-    """
-
-    name: str
-    fitted_phi_rad: float
-    fitted_length_m: float
-    held_phi_rad: float
-    held_length_m: float
-    chance: float
-
-
 def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     """Of a log's residuals (rows,), of angle and length (lags, 2) from lag 1 on; far ones are cut."""
     r = residual.reshape(-1, 2)
@@ -1189,92 +1129,6 @@ def autocorrelation(residual: FloatArray, lags: int) -> FloatArray:
     z = z - z.mean(axis=0)
     power = np.maximum(np.sum(z * z, axis=0), 1e-12)
     return np.array([np.sum(z[k:] * z[:-k], axis=0) / power for k in range(1, lags + 1)]).reshape(-1, 2)
-
-
-def uncertainty(solution: Solution) -> Uncertainty:
-    """Covariance of the parameters, the larger of the white one and the sandwich."""
-    problem, r, J, w = solution.problem, solution.residual, solution.J, solution.weights
-    P, spans = len(problem.names), problem.spans
-    rows = spans[-1].stop
-    scale = max(robust_sigma(r[:rows]), 1e-9)
-    # The prior is known, the scale of the residuals is not.
-    size = np.concatenate([np.full(rows, 1.0 / scale**2), np.ones(len(r) - rows)])
-    H = (J * (w * size)[:, None]).T @ J
-    inverse = scaled_inverse(H)
-    middle = (J[rows:]).T @ J[rows:]
-    for track, span in zip(problem.tracks, spans, strict=True):
-        g = (J[span] * (w * size * r)[span, None]).reshape(-1, 2, J.shape[1]).sum(axis=1)
-        period = float(np.median(np.diff(track.t_s))) if len(track.t_s) > 1 else track.tick_s
-        rows_of_s = 1.0 / max(period, 1e-4)
-        c = autocorrelation(r[span], min(round(_LONGEST_S * rows_of_s), len(g) // 4))
-        apart = np.flatnonzero((c < _BAND / math.sqrt(len(g))).all(axis=1))
-        alike = int(apart[0]) if len(apart) else len(c)
-        over = 1 + min(max(round(_SPAN_S * rows_of_s), alike, 1), len(g) // 4)
-        # Sums over all windows of a length have Bartlett's weights of the lags below it.
-        total = np.cumsum(np.pad(g, ((over, over - 1), (0, 0))), axis=0)
-        windows = total[over:] - total[:-over]
-        middle = middle + windows.T @ windows / over
-    # With far rows weighted down, the mean of w r^2 stands for the scale of the others.
-    sandwich = (inverse @ middle @ inverse)[:P, :P]
-    spread = float(np.mean((w * r**2)[:rows])) / scale**2
-    white = inverse[:P, :P] * max(spread, 1.0)
-    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(white), 1e-300), 1.0))
-    coloured = white * np.outer(ratio, ratio)
-    between = _between(solution, w * size, inverse, ratio)
-    covariance = coloured + between
-    scatter = np.sqrt(1.0 + np.diag(between) / np.maximum(np.diag(coloured), 1e-300))
-    # What moves no residual at all is not known exactly, but not at all.
-    sigma = np.where(np.diag(H)[:P] > 0.0, np.sqrt(np.diag(covariance)), np.inf)
-    return Uncertainty(
-        dict(zip(problem.names, sigma.tolist(), strict=True)),
-        dict(zip(problem.names, ratio.tolist(), strict=True)),
-        dict(zip(problem.names, scatter.tolist(), strict=True)),
-        covariance,
-        covariance / np.outer(sigma, sigma),
-        scale,
-    )
-
-
-def _between(solution: Solution, w: FloatArray, inverse: FloatArray, raised: FloatArray) -> FloatArray:
-    """Covariance (P, P) of the parameters by what stretches of the logs disagree on.
-
-    Parameters
-    ----------
-    w : (rows,) weights of the residuals. inverse : H^-1 of all unknowns.
-    raised : (P,) by how much colour raises deviations.
-    """
-    from scipy.special import chdtrc
-
-    problem, P = solution.problem, len(solution.problem.names)
-    matrices, slopes = [], []
-    for track, span in zip(problem.tracks, problem.spans, strict=True):
-        J, r, some = solution.J[span], solution.residual[span], w[span]
-        ends = np.linspace(track.t_s[0], track.t_s[-1], _STRETCHES + 1)[1:-1]
-        stretch = np.repeat(np.searchsorted(ends, track.t_s, side="right"), 2)
-        for k in range(_STRETCHES):
-            rows = stretch == k
-            WJ = J[rows] * some[rows, None]
-            matrices.append(WJ.T @ J[rows])
-            slopes.append(WJ.T @ r[rows])
-    H, g = np.array(matrices), np.array(slopes)
-    whole = np.einsum("sii->si", H)[:, :P]
-    by = np.einsum("ij,sjp->sip", inverse, H[:, :, :P])
-    own = whole - np.einsum("sip,sip->sp", H[:, :, :P], by)
-    pull = g[:, :P] - np.einsum("sip,i->sp", by, g.sum(axis=0))
-    out = np.zeros((P, P))
-    for i in range(P):
-        told = own[:, i] > 1e-6 * np.maximum(whole[:, i], 1e-300)
-        count, h = int(told.sum()), own[told, i] / raised[i] ** 2
-        if count < 2:
-            continue
-        Q = float(np.sum((pull[told, i] / own[told, i]) ** 2 * h))
-        if chdtrc(count, Q) > _SCATTERS:
-            continue
-        # What is the same in all runs cannot be further off than a person states.
-        T = min((Q - count) / (h.sum() - np.sum(h**2) / h.sum()), problem.unknowns.sigma[i] ** 2)
-        out[i, i] += T
-        out += T * by[:, :P, i].T @ by[:, :P, i]
-    return out
 
 
 def colour_of(solution: Solution) -> tuple[Colour, ...]:
@@ -1288,565 +1142,15 @@ def colour_of(solution: Solution) -> tuple[Colour, ...]:
             Colour(
                 track.name,
                 (float(c[0, 0]), float(c[0, 1])),
-                float(np.mean(np.abs(c) > _BAND / math.sqrt(len(r)))),
+                float(np.mean(np.abs(c) > BAND / math.sqrt(len(r)))),
                 far,
             )
         )
     return tuple(out)
 
 
-def rms_by_track(problem: Problem, residual: FloatArray, far: float = 6.0) -> list[tuple[float, float]]:
-    """RMS of angle [rad] and length [m] of each log, rows beyond so many deviations left out."""
-    out = []
-    for track, span in zip(problem.tracks, problem.spans, strict=True):
-        r = residual[span].reshape(-1, 2)
-        size = np.maximum(1.4826 * np.median(np.abs(r)), 1e-9)
-        near = (np.abs(r) < far * size).all(axis=1)
-        error = np.linalg.solve(track.whitening[near], r[near][:, :, None])[:, :, 0]
-        phi, length = np.sqrt(np.mean(error**2, axis=0)).tolist()
-        out.append((phi, length))
-    return out
-
-
-def held_back(solution: Solution) -> list[HeldLog]:
-    """Each log predicted by a fit to all others; empty for a single one.
-
-    Of the log that is held back only its start, delay and the camera's offset are estimated. A log that
-    alone tells a parameter keeps the others from telling it; that one stays as it was found.
-    """
-    from scipy.special import chdtrc
-
-    problem = solution.problem
-    if len(problem.tracks) < 2:
-        return []
-    inside = rms_by_track(problem, solution.residual)
-    found = {**problem.held, **solution.values}
-    known, out = uncertainty(solution), []
-    raised = known.scale * max(known.inflation.values(), default=1.0)
-    for k, (x, told, gain) in enumerate(_without_each(solution)):
-        track = problem.tracks[k]
-        alone = replace(problem, tracks=[track], names=(), held={**found, **problem.values(x)})
-        _, _, residual, _ = solve(alone, x[_places(problem, alone)], 15)
-        (phi, length) = rms_by_track(alone, residual)[0]
-        worse = max(2.0 * gain / raised**2, 0.0)
-        out.append(HeldLog(track.name, *inside[k], phi, length, float(chdtrc(told, worse))))
-    return out
-
-
-_CHORDS = 20
-_NEAR = 0.05
-"""Relative change of a parameter within which the derivatives of the fit to all logs serve."""
-_STILL = 1e-4
-"""Robust cost: a step that would gain less is not taken."""
-
-
-def _without_each(solution: Solution) -> list[tuple[FloatArray, int, float]]:
-    """For each log the fit to all others: all unknowns, how many parameters it tells, cost that it gains.
-
-    It lies near the fit to all logs, so the derivatives there serve (a chord method), and one batch of
-    simulations moves the fits of all logs at once. One that does not come to rest nearby is sought by itself.
-    """
-    problem, tracks, J = solution.problem, solution.problem.tracks, solution.J
-    u, priors, count = problem.unknowns, problem.unknowns.priors, len(solution.problem.tracks)
-    free, kept = np.ones((count, u.size), dtype=bool), np.ones((count, len(J)), dtype=bool)
-    for k, span in enumerate(problem.spans):
-        kinds = {track.hoses for i, track in enumerate(tracks) if i != k}
-        free[k, : len(problem.names)] = [_told_by(name, kinds) for name in problem.names]
-        free[k, u.starts[k]] = False
-        free[k, u.delays[k]] = u.delays.count(u.delays[k]) > 1
-        kept[k, span], kept[k, len(J) - len(priors) :] = False, free[k, priors]
-    weighted = solution.weighted
-    whole = weighted.T @ J
-    curved = [whole - weighted[~rows].T @ J[~rows] for rows in kept]
-    xs, residual = np.tile(solution.x, (count, 1)), np.tile(solution.residual, (count, 1))
-    first = _robust(problem, residual * kept)
-    cost = first.copy()
-    going = np.ones(count, dtype=bool)
-    rested = ~going
-    for _ in range(_CHORDS):
-        to = xs.copy()
-        for k in np.flatnonzero(going).tolist():
-            slope = J.T @ (weights(problem, residual[k]) * residual[k] * kept[k])
-            step, gain = _step_within(curved[k], slope, free[k], u.low - xs[k], u.high - xs[k])
-            to[k] += step
-            rested[k] = gain < _STILL
-        going &= ~rested
-        at = np.flatnonzero(going)
-        if not len(at):
-            break
-        found = residuals(problem, to[at])
-        after = _robust(problem, found * kept[at])
-        going[at] = after < cost[at]
-        better = at[going[at]]
-        xs[better], residual[better], cost[better] = to[better], found[going[at]], after[going[at]]
-    size = np.maximum(np.abs(solution.x), u.scale)[: len(problem.names)]
-    near = (np.abs(xs - solution.x)[:, : len(problem.names)] < _NEAR * size).all(axis=1)
-    for k in np.flatnonzero(~(rested & near)).tolist():
-        others = [track for i, track in enumerate(tracks) if i != k]
-        names = tuple(name for name, told in zip(problem.names, free[k], strict=False) if told)
-        less = replace(problem, tracks=others, names=names, held={**problem.held, **solution.values})
-        places = _places(problem, less)
-        first[k] = _robust(less, residuals(less, solution.x[places][None]))[0]
-        xs[k, places], cost[k], _, _ = solve(less, xs[k, places], 15)
-    told = free[:, : len(problem.names)].sum(axis=1).tolist()
-    return list(zip(xs, told, (first - cost).tolist(), strict=True))
-
-
-def _step_within(
-    H: FloatArray, slope: FloatArray, free: BoolArray, low: FloatArray, high: FloatArray
-) -> tuple[FloatArray, float]:
-    """The step to the minimum of a quadratic cost over what is free and stays within bounds, and its gain."""
-    free = free.copy()
-    while True:
-        at = np.flatnonzero(free)
-        step = np.zeros(len(slope))
-        step[at] = -scaled_inverse(H[np.ix_(at, at)]) @ slope[at]
-        outside = (step < low) | (step > high)
-        if not outside.any():
-            return step, float(-0.5 * slope @ step)
-        free &= ~outside
-
-
-def _places(problem: Problem, part: Problem) -> IntArray:
-    """Where the unknowns of a problem with some of the logs are among those of the one with all."""
-    whole, mine = problem.unknowns, part.unknowns
-    out = np.empty(mine.size, dtype=np.int64)
-    out[: len(part.names)] = [problem.names.index(name) for name in part.names]
-    out[mine.offset] = range(whole.offset.start, whole.offset.stop)
-    of_track = {id(track): k for k, track in enumerate(problem.tracks)}
-    for k, track in enumerate(part.tracks):
-        at = of_track[id(track)]
-        out[mine.starts[k]] = range(whole.starts[at].start, whole.starts[at].stop)
-        out[mine.delays[k]] = whole.delays[at]
-    return out
-
-
-def _told_by(name: str, kinds: set[bool]) -> bool:
-    acts = PARAMETERS[name].acts
-    return acts in ("all", "prior") or (acts == "pumps") in kinds
-
-
-# ----------------------------------------------------------------------
-# Damping by the logarithmic decrement (3.39), (3.40), from peaks that outliers do not make.
-#
-# Single readings that stand away from the cubic through their six neighbours are replaced by it. The
-# extremes of what is left are found once the motion has come back by a fifth of its amplitude, so that
-# noise makes none, and each is the vertex of a parabola through the rows about it. The amplitude is that from
-# peak to peak, which does not see an offset that creeps; on the raw curve (3.39) yields about 0.004.
-#
-#     delta = ln(x_i / x_(i+1)) over a period,   zeta = delta / sqrt(4 pi^2 + delta^2)
-#
-# delta is the median of the slopes between all pairs of amplitudes (Theil and Sen), with the standard
-# deviation that the scatter about that line gives.
-
-_HALF_WINDOW = 3
-_FAR = 4.0
-_FEWEST = 4
-_FLOOR = 10.0
-_LARGEST_SHARE = 0.1
-
-
-@dataclass(frozen=True)
-class Decrement:
-    """A decaying swing.
-
-    Attributes
-    ----------
-    zeta, sigma : damping ratio and its standard deviation. frequency_hz : of the swing.
-    peak_at_s, peak : (n,) extremes that were used. outliers : readings that were replaced.
-    """
-
-    zeta: float
-    sigma: float
-    frequency_hz: float
-    peak_at_s: FloatArray
-    peak: FloatArray
-    outliers: int
-
-
-def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
-    """Values (n,) with single ones that stand away from their neighbours replaced, and how many."""
-    n = len(values)
-    at = np.clip(np.arange(n)[:, None] + np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1), 0, n - 1)
-    # A cubic through the other rows of the window follows a swing, which a median does not.
-    x = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1, dtype=np.float64)
-    others = np.delete(np.arange(2 * _HALF_WINDOW + 1), _HALF_WINDOW)
-    V = np.vander(x[others], 4)
-    mid = np.linalg.pinv(V)[-1]
-    guess = values[at][:, others] @ mid
-    error = values - guess
-    scale = robust_sigma(error)
-    # A cubic misses a tenth of a fast swing's window.
-    local = np.ptp(values[at][:, others], axis=1)
-    far = np.abs(error) > np.maximum(np.maximum(_FAR * scale, 0.25 * local), 1e-12)
-    # Of neighbours that all look wrong only the worst is.
-    worst = np.abs(error) >= np.abs(error)[at].max(axis=1) - 1e-15
-    bad = far & worst
-    out = values.copy()
-    out[bad] = guess[bad]
-    return out, int(bad.sum())
-
-
-def _turns(y: FloatArray, share: float) -> IntArray:
-    """Rows of the extremes, each confirmed by a return of `share` times the swing before it."""
-    found: list[int] = []
-    top = low = 0
-    direction = 0
-    swing = float(np.ptp(y[: max(len(y) // 8, 8)]))
-    for i in range(1, len(y)):
-        if y[i] > y[top]:
-            top = i
-        if y[i] < y[low]:
-            low = i
-        back = share * swing
-        if direction >= 0 and y[top] - y[i] > back:
-            found.append(top)
-            swing = abs(float(y[top] - y[found[-2]])) if len(found) > 1 else swing
-            direction, low = -1, i
-            top = i
-        elif direction <= 0 and y[i] - y[low] > back:
-            found.append(low)
-            swing = abs(float(y[low] - y[found[-2]])) if len(found) > 1 else swing
-            direction, top = 1, i
-            low = i
-    return np.array(found, dtype=np.int64)
-
-
-def _vertex(t: FloatArray, y: FloatArray, i: int, reach: int) -> tuple[float, float]:
-    a, b = max(i - reach, 0), min(i + reach + 1, len(y))
-    if b - a < 3:
-        return float(t[i]), float(y[i])
-    c = np.polyfit(t[a:b] - t[i], y[a:b], 2)
-    if c[0] == 0.0:
-        return float(t[i]), float(y[i])
-    at = float(np.clip(-0.5 * c[1] / c[0], t[a] - t[i], t[b - 1] - t[i]))
-    return float(t[i]) + at, float(np.polyval(c, at))
-
-
-def _regular(t: FloatArray, y: FloatArray, at: FloatArray, peak: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Extremes where their neighbours say that they are.
-
-    A vertex that is sought among noisy readings is too high, the more so the smaller the swing. The times of
-    the extremes go smoothly, so that of each follows from all, and a parabola about it gives its height.
-    """
-    k = np.arange(len(at), dtype=np.float64)
-    big = np.concatenate([[True], np.abs(np.diff(peak)) > 0.1 * np.abs(np.diff(peak)).max()])
-    count = len(big) if bool(big.all()) else max(int(np.argmin(big)), _FEWEST)
-    smooth = np.polyval(np.polyfit(k[:count], at[:count], 2 if count > 5 else 1), k[:count])
-    half = float(np.median(np.diff(smooth)))
-    if float(np.abs(smooth - at[:count]).max()) > 0.3 * half:
-        return at, peak
-    heights = peak[:count].copy()
-    for i, centre in enumerate(smooth.tolist()):
-        near = np.abs(t - centre) <= 0.32 * half
-        if int(near.sum()) >= 4:
-            heights[i] = np.polyval(np.polyfit(t[near] - centre, y[near], 2), 0.0)
-    return np.asarray(smooth, dtype=np.float64), heights
-
-
-def decrement(t_s: FloatArray, phi_rad: FloatArray, noise_rad: float = 0.0) -> Decrement:
-    """Damping of a free swing from its angle (n,) at times (n,).
-
-    Parameters
-    ----------
-    noise_rad : standard deviation of a reading; swings below ten times that are left out,
-        since noise makes small extremes larger.
-
-    Raises `BadInputError` when fewer than four extremes stand out.
-    """
-    y, outliers = without_outliers(np.asarray(phi_rad, dtype=np.float64))
-    turns = _turns(y, 0.3)
-    if len(turns) < _FEWEST:
-        raise BadInputError(f"swing: found {len(turns)} extremes, expected at least {_FEWEST}")
-    rows = float(np.median(np.diff(turns)))
-    reach = max(round(0.25 * rows), 1)
-    ends = [_vertex(t_s, y, int(i), reach) for i in turns]
-    at, peak = _regular(t_s, y, np.array([e[0] for e in ends]), np.array([e[1] for e in ends]))
-    height = np.abs(np.diff(peak))
-    floor = max(_FLOOR * noise_rad, _LARGEST_SHARE * float(height.max()))
-    small = np.nonzero(height < floor)[0]
-    used = int(small[0]) if len(small) else len(height)
-    if used < _FEWEST - 1:
-        raise BadInputError(f"swing: found {used + 1} extremes above the noise, expected at least {_FEWEST}")
-    k = np.arange(used, dtype=np.float64)
-    log = np.log(height[:used])
-    i, j = np.triu_indices(used, 1)
-    slope = float(np.median((log[j] - log[i]) / (k[j] - k[i])))
-    scatter = robust_sigma(log - slope * k - np.median(log - slope * k))
-    lever = k - k.mean()
-    total = max(float(np.sum(lever**2)), 1e-12)
-    # The scatter of few peaks may be small by chance; it cannot be less than what the noise makes.
-    by_noise = math.sqrt(float(np.sum((lever * noise_rad / height[:used]) ** 2))) / total
-    spread = 1.2 * max(scatter / math.sqrt(total), by_noise)
-    delta, delta_sigma = -2.0 * slope, 2.0 * spread
-    half = float(np.median(np.diff(at[: used + 1])))
-    norm = math.hypot(delta, 2.0 * math.pi)
-    return Decrement(
-        delta / norm,
-        delta_sigma * (2.0 * math.pi) ** 2 / norm**3,
-        0.5 / half,
-        at[: used + 1],
-        peak[: used + 1],
-        outliers,
-    )
-
-
-# ----------------------------------------------------------------------
-# Stiffness from hanging weights or steady elongations: linear and polynomial, zero at zero (Fig. 3.10).
-#
-#     F = (k0 + k1 eps + k2 eps^2 + ...) eps
-#
-# by least squares on the force, with the standard deviation and correlation of the coefficients. The order
-# is the one whose force at points left out is best; a higher one has to beat a lower by a twentieth.
-
-_ORDERS = (1, 2, 3)
-_HIGHER = 0.95
-
-
-@dataclass(frozen=True)
-class StiffnessFit:
-    """A law of one order.
-
-    Attributes
-    ----------
-    coefficients, sigma : (order,) k0 [N/m], k1 [N/m^2], ...
-    correlation : (order, order). rms_N : over the points. left_out_rms_N : over points left out in turn.
-    """
-
-    coefficients: FloatArray
-    sigma: FloatArray
-    correlation: FloatArray
-    rms_N: float
-    left_out_rms_N: float
-
-    @property
-    def order(self) -> int:
-        """Number of coefficients."""
-        return len(self.coefficients)
-
-    def force_N(self, elongation_m: FloatArray) -> FloatArray:
-        """Force [N] at elongations (n,) [m]."""
-        return np.asarray(np.polyval(self.coefficients[::-1], elongation_m) * elongation_m)
-
-
-def _one(eps: FloatArray, force: FloatArray, order: int) -> StiffnessFit:
-    A = np.stack([eps ** (k + 1) for k in range(order)], axis=1)
-    size = np.sqrt(np.sum(A * A, axis=0))
-    B = A / size
-    inverse = np.linalg.inv(B.T @ B)
-    k = inverse @ (B.T @ force)
-    residual = force - B @ k
-    leverage = np.sum((B @ inverse) * B, axis=1)
-    left = residual / np.maximum(1.0 - leverage, 1e-6)
-    variance = float(residual @ residual) / max(len(eps) - order, 1)
-    spread = np.sqrt(variance * np.diag(inverse))
-    root = np.sqrt(np.diag(inverse))
-    return StiffnessFit(
-        k / size,
-        spread / size,
-        inverse / np.outer(root, root),
-        rms(residual),
-        rms(left),
-    )
-
-
-def fit_stiffness(name: str, elongation_m: FloatArray, force_N: FloatArray) -> tuple[list[StiffnessFit], int]:
-    """Laws of all orders that the points allow, and the index of the one to use.
-
-    Parameters
-    ----------
-    elongation_m, force_N : (n,) from the rest length on; points at zero say nothing.
-
-    Raises `BadInputError` for fewer than three points, or forces that do not pull with the elongation.
-    """
-    eps, force = np.asarray(elongation_m, dtype=np.float64), np.asarray(force_N, dtype=np.float64)
-    some = np.abs(eps) > 1e-9
-    eps, force = eps[some], force[some]
-    levels = len(np.unique(np.round(eps, 9)))
-    if levels < 3:
-        raise BadInputError(f"{name}: has {levels} elongations apart from zero, expected at least 3")
-    if not float(eps @ force) > 0.0:
-        raise BadInputError(f"{name}: force and elongation have opposite signs, expected the same")
-    fits = [_one(eps, force, order) for order in _ORDERS if order < levels]
-    best = 0
-    for k in range(1, len(fits)):
-        if fits[k].left_out_rms_N < _HIGHER * fits[best].left_out_rms_N:
-            best = k
-    return fits, best
-
-
-# ----------------------------------------------------------------------
-# Which experiment to do next: the one that would shrink the worst standard deviation most.
-#
-# Experiments add their information: S_after = S_now + S_experiment, each with its own start eliminated. What
-# they share with the logs at hand, the offset of the camera's plane and, with commands, the delay, is among
-# the unknowns, so that its prior counts once. The information of an experiment that was not done yet is that
-# of a simulated one on the identified rig, with a picture at each tick and the noise of the logs at hand.
-
-_TYPICAL = (0.004, 0.0004)
-
-
-@dataclass(frozen=True)
-class Prospect:
-    """Relative standard deviations after one more experiment, and the worst of them."""
-
-    name: str
-    what: str
-    relative: dict[str, float]
-    worst: str
-    worst_relative: float
-
-
-def _experiments(
-    rest_length_m: float, tick_s: float, noise: FloatArray
-) -> Iterator[tuple[Track, Start, str]]:
-    """What `calib record --do` has a rig do, by its names there: tracks yet without a head, starts, words.
-
-    Parameters
-    ----------
-    noise : (2,) standard deviations of angle [rad] and length [m].
-    """
-    from calib.io.experiments import EXPERIMENTS, MOST_PWM
-
-    for name, one in EXPERIMENTS.items():
-        t = tick_s * np.arange(round(one.seconds / tick_s), dtype=np.float64)
-        shares = (
-            np.zeros((len(t), 2)) if one.command is None else np.array(list(map(one.command, t.tolist())))
-        )
-        W = np.broadcast_to(np.diag(1.0 / noise), (len(t) - 1, 2, 2)).copy()
-        track = Track(name, tick_s, MOST_PWM * shares, not one.by_hand, t[1:], np.zeros((len(t) - 1, 2)), W)
-        yield track, Start(0.5 if one.by_hand else 0.0, rest_length_m), f"{one.seconds:g} s, {one.asks}"
-
-
-def _information(
-    problem: Problem, names: tuple[str, ...], values: Mapping[str, float], track: Track, start: Start
-) -> FloatArray | None:
-    """Information (P + 3, P + 3) about relative changes and what logs share, from one experiment.
-
-    None where it leaves the model. What the experiment brings in that is not asked for, as the pumps'
-    strength, is eliminated.
-    """
-    try:
-        head, _ = heads_of(track, [problem.pair(track, values)], [start], 0.0)
-    except BadInputError:
-        return None
-    if not np.isfinite(head).all():
-        return None
-    track = replace(track, head=head[0])
-    mine = candidates(problem.nominal, not track.hoses, track.hoses, False, problem.stated)
-    more = tuple(name for name in mine if name not in names and name != "lambda3")
-    if any(name.startswith("elongation") for name in names):
-        more = tuple(name for name in more if name != "strength1")
-    # Priors are in the information so far.
-    flat = dict.fromkeys(PARAMETERS, math.inf)
-    alone = replace(problem, tracks=[track], names=names + more, held=values, delay_s=0.0, stated=flat)
-    x = first_guess(alone, values)
-    x[alone.unknowns.starts[0]] = start.phi_rad, start.length_m
-    residual, J = jacobian(alone, x)
-    shared = _shared(alone)
-    J[alone.spans[-1].stop :, shared] = 0.0
-    S = informative(alone, np.zeros_like(residual), J, x, shared)
-    P, m = len(names), len(more)
-    out = np.zeros((P + _SHARED, P + _SHARED))
-    some = P + len(shared)
-    out[:some, :some] = _eliminated(S, [*range(P), *range(P + m, len(S))], 1e-10)
-    return out
-
-
-_SHARED = 3
-
-
-def _shared(problem: Problem) -> list[int]:
-    """Unknowns that logs share: the offset of the camera's plane, and the delay of those with commands."""
-    at = problem.unknowns
-    delays = [delay for delay, one in zip(at.delays, problem.tracks, strict=True) if one.hoses]
-    return [at.offset.start, at.offset.start + 1, *delays[:1]]
-
-
-def _at_hand(solution: Solution, known: Uncertainty, size: FloatArray) -> FloatArray:
-    """Information (P + 3, P + 3) of the logs at hand, as `_information`: of the parameters that of `known`,
-    and what they tell of the rest as white residuals do."""
-    problem, P = solution.problem, len(solution.problem.names)
-    J = solution.J.copy()
-    J[: problem.spans[-1].stop] /= known.scale
-    shared = _shared(problem)
-    S = informative(problem, solution.residual, J, solution.x, shared)
-    mixed, rest = S[:P, P:], S[P:, P:]
-    out = np.diag([0.0] * P + [_DELAY_SIGMA_S**-2] * _SHARED)
-    out[P : len(S), P : len(S)] = rest
-    out[:P, P : len(S)], out[P : len(S), :P] = mixed, mixed.T
-    alone = np.linalg.pinv(known.covariance / np.outer(size, size), hermitian=True)
-    out[:P, :P] = alone + mixed @ np.linalg.solve(rest, mixed.T)
-    return out
-
-
-def prospects(solution: Solution, known: Uncertainty) -> tuple[Prospect, ...]:
-    """All experiments, the most useful first.
-
-    Judged are the parameters that were estimated and those that could not be told for want of excitation,
-    lambda3 apart, which no experiment tells from lambda2, and a creep that is not there.
-    """
-    problem = solution.problem
-    values = {**values_of(problem.nominal), **problem.held, **solution.values}
-    vague = [n for n, why in solution.fixed.items() if n != "lambda3" and NO_CREEP not in why]
-    order = list(PARAMETERS)
-    names = tuple(sorted([*problem.names, *vague], key=order.index))
-    now = np.zeros((len(names) + _SHARED, len(names) + _SHARED))
-    at = [names.index(name) for name in problem.names] + [len(names) + k for k in range(_SHARED)]
-    size = np.array([max(abs(values[n]), 0.1 * PARAMETERS[n].scale) for n in problem.names])
-    now[np.ix_(at, at)] = _at_hand(solution, known, size)
-    W = np.concatenate([track.whitening for track in problem.tracks])
-    inverse = np.linalg.inv(W)
-    noise = known.scale * np.sqrt(np.median(np.sum(inverse**2, axis=2), axis=0))
-    noise = np.asarray(np.where(np.isfinite(noise) & (noise > 0.0), noise, _TYPICAL))
-    out = []
-    rest = problem.nominal.plant.rest_length_m
-    for track, start, what in _experiments(rest, problem.nominal.pump.tick_s, noise):
-        gained = _information(problem, names, values, track, start)
-        if gained is None:
-            continue
-        relative = _relative(now + gained, names)
-        # What a drawing tells best is no reason for an experiment.
-        asked = [name for name in names if math.isinf(PARAMETERS[name].share)] or names
-        worst = max(asked, key=lambda n: relative[n])
-        out.append(Prospect(track.name, what, relative, worst, relative[worst]))
-    return tuple(sorted(out, key=lambda p: (p.worst_relative, sum(p.relative.values()))))
-
-
-def _relative(S: FloatArray, names: Sequence[str]) -> dict[str, float]:
-    """Relative standard deviations of an information matrix; those that nothing bounds count as 10."""
-    prior = 1e-2 * np.eye(len(S))
-    sigma = np.sqrt(np.diag(np.linalg.inv(S + prior)))[: len(names)]
-    return {
-        name: min(float(s), 10.0) if math.isfinite(s) else 10.0 for name, s in zip(names, sigma, strict=True)
-    }
-
-
-# ----------------------------------------------------------------------
-# What an identification is worth in words: verdict, reasons, remarks and advice.
-#
-# - unidentifiable: the logs cannot tell a parameter that they should.
-# - poor: the model does not explain the logs (residuals far above the noise, a held-back log predicted much
-#   worse than fitted), a parameter lies at a bound, or an important one is vague.
-
-_MOST_SCALE = 2.5
-_MOST_INFLATION = 8.0
-_MOST_HELD, _LEAST_CHANCE = 1.5, 0.01
-_MOST_RELATIVE = 0.25
-_MOST_SCATTER = 1.5
-_SLOW = 1.5
-"""Periods of a loop for which a log's commands stand, beyond which it may have sent others in between."""
-_STRONG = 0.95
-_FAR_ROWS = 0.05
-_EXPLAINED = 3e-3, 1.5e-4
-"""Angle [rad] and length [m]: a model that misses by less, half a Pixy2's pixel, explains logs of a camera
-that sees more as well."""
-_MOST_APART_S = 0.04
-_PUMPS_APART_S = 0.01
-_APART_SIGMA = 5.0
-
-
-def _bounds(solution: Solution) -> list[str]:
+def at_bounds(solution: Solution) -> list[str]:
+    """Sentences on the parameters that lie at a bound."""
     out = []
     for name, value in solution.values.items():
         spec = PARAMETERS[name]
@@ -1854,355 +1158,3 @@ def _bounds(solution: Solution) -> list[str]:
         if value - spec.low < near or spec.high - value < near:
             out.append(f"{label_of(name)} lies at its bound {value:.4g} {spec.unit}".rstrip())
     return out
-
-
-def _of_fit(solution: Solution, known: Uncertainty, colours: Sequence[Colour]) -> list[Finding]:
-    advice = "look at what known states: the mass, gravity and the bellows' radius are in all forces"
-    out = [Finding("poor", text, advice) for text in _bounds(solution)]
-
-    def poor(text: str) -> None:
-        out.append(Finding("poor", text))
-
-    def remark(text: str) -> None:
-        out.append(Finding("remark", text))
-
-    missed = rms_by_track(solution.problem, solution.residual, math.inf)
-    unlike = remark if (np.array(missed) < _EXPLAINED).all() else poor
-    if known.scale > _MOST_SCALE:
-        unlike(
-            f"the residuals are {known.scale:.1f} times what the sensor's noise explains; the model misses "
-            "something, or the camera's jitter is larger than the rig's file says"
-        )
-    worst = max(known.inflation, key=lambda n: known.inflation[n])
-    if known.inflation[worst] > _MOST_INFLATION:
-        poor(
-            f"the residuals are so coloured that the deviation of {label_of(worst)} had to be raised "
-            f"{known.inflation[worst]:.1f} times"
-        )
-    slow = _slowly_commanded(solution.problem)
-    for colour in colours:
-        if not colour.white:
-            remark(
-                f"{colour.name}: residuals are not white ({100.0 * colour.outside:.0f} % of the lags outside "
-                f"the 95 % band, {max(colour.first, key=abs):+.2f} from row to row); deviations are raised"
-            )
-        if colour.name in slow and not colour.white:
-            every = f"{1e3 * slow[colour.name]:.3g} ms"
-            text = f"{colour.name}: its commands come every {every}; what the pumps got in between is missing"
-            advice = "write each command into the log when it is sent, or state known: {pump: {tick_s: ...}}"
-            out.append(Finding("remark", text, advice))
-        if colour.share_far > _FAR_ROWS:
-            unlike(f"{colour.name}: {100.0 * colour.share_far:.0f} % of the poses are far off")
-    labels = [label_of(name) for name in solution.problem.names]
-    groups = tied_groups(known.correlation, _STRONG)
-    if groups:
-        texts = "; ".join(", ".join(labels[k] for k in group) for group in groups)
-        remark(f"hardly told apart, with correlations beyond {_STRONG:g}: {texts}")
-    if solution.starts > 1 and solution.agreeing == 1:
-        remark(f"one of {solution.starts} starts alone came to this minimum; there may be others")
-    return out
-
-
-def _slowly_commanded(problem: Problem) -> dict[str, float]:
-    """Periods [s] of the commands of logs that hold fewer of them than the pumps are known to get."""
-    loop_s = problem.nominal.pump.tick_s
-    pumped = [track for track in problem.tracks if track.hoses]
-    return {track.name: track.tick_s for track in pumped if track.tick_s > _SLOW * loop_s}
-
-
-def _one_more(solution: Solution, columns: Iterable[FloatArray]) -> Iterator[tuple[float, float] | None]:
-    """What one unknown more would be and its deviation, for derivatives (rows,) of the residuals by it.
-
-    One step of Gauss and Newton in which all other unknowns follow. None where they can make up for it.
-    """
-    r, w, WJ, inverse = solution.residual, solution.weights, solution.weighted, solution.inverse
-    for column in columns:
-        b, whole = WJ.T @ column, float(column @ (w * column))
-        own = whole - float(b @ inverse @ b)
-        slope = float(column @ (w * r) - b @ inverse @ (WJ.T @ r))
-        yield (-slope / own, 1.0 / math.sqrt(own)) if own > 1e-6 * whole and own > 0.0 else None
-
-
-def own_delays(solution: Solution) -> list[tuple[str, float, float]]:
-    """By how much each log's rows come later than those of the others [s], and the deviation of that.
-
-    Only of logs that share a delay. Columns that are late in one log alone are otherwise taken for a delay
-    between, and for a damping and a creep that are not there.
-    """
-    problem, J = solution.problem, solution.J
-    delays, spans = problem.unknowns.delays, problem.spans
-    shared = [k for k, at in enumerate(delays) if delays.count(at) > 1]
-    columns = []
-    for k in shared:
-        column = np.zeros(len(J))
-        column[spans[k]] = J[spans[k], delays[k]]
-        columns.append(column)
-    found = zip(shared, _one_more(solution, columns), strict=True)
-    return [(problem.tracks[k].name, *one) for k, one in found if one is not None]
-
-
-def pump_delay(solution: Solution) -> tuple[float, float] | None:
-    """By how much the commands of pump 1 come later than those of pump 2 [s], and the deviation of that.
-
-    None without pumps. A column that is late is otherwise taken for a damping that is not there.
-    """
-    problem, x = solution.problem, solution.x
-    column = np.zeros(len(solution.residual))
-    for k, (track, span) in enumerate(zip(problem.tracks, problem.spans, strict=True)):
-        if track.hoses:
-            n, ends = len(track.pwm), []
-            for shift in (1, -1):
-                pwm = track.pwm.copy()
-                pwm[:, 0] = track.pwm[np.clip(np.arange(n) + shift, 0, n - 1), 0]
-                ends.append(head_of(problem, x, k, replace(track, pwm=pwm)))
-            slope = (ends[0] - ends[1]) / (2.0 * track.tick_s)
-            column[span] = -_whitened(track, slope).reshape(-1)
-    return next(iter(_one_more(solution, [column]))) if np.isfinite(column).all() and column.any() else None
-
-
-@dataclass(frozen=True)
-class Moved:
-    """A shift of all poses of a log from a time on: by angle [rad] and length [m], in deviations.
-
-    Attributes
-    ----------
-    from_s : time in the log; zero for all of it. readings : the shift over the noise of one reading.
-    """
-
-    name: str
-    from_s: float
-    phi_rad: float
-    length_m: float
-    readings: float
-    deviations: float
-
-
-def moved_camera(solution: Solution) -> Moved | None:
-    """The clearest shift of a log's pictures from some time on, alike in pixels: of a camera that moved."""
-    problem, r, w = solution.problem, solution.residual, solution.weights
-    WJ, inverse, found = solution.weighted, solution.inverse, list[Moved]()
-    pull = inverse @ (WJ.T @ r)
-    for track, span in zip(problem.tracks, problem.spans, strict=True):
-        # Sums from each row on, over both whitened readings: of pictures they are u and v.
-        by, slope, power = (
-            np.cumsum(rows[span].reshape(len(track.t_s), 2, -1)[::-1], axis=0)[::-1]
-            for rows in (WJ, w * r, w)
-        )
-        ends = np.linspace(0.0, len(track.t_s), _MOMENTS + 1)[:-1].astype(int)
-        for k in ends if len(problem.tracks) > 1 else ends[1:]:
-            own = np.diag(power[k, :, 0]) - by[k] @ inverse @ by[k].T
-            size, axes = np.linalg.eigh(own)
-            if size[0] > 1e-6 * power[k].max():
-                g = slope[k, :, 0] - by[k] @ pull
-                shift = -axes @ ((axes.T @ g) / size)
-                phi, length = np.linalg.solve(track.whitening[k], shift).tolist()
-                at = float(track.t_s[k]) if k else 0.0
-                far = math.sqrt(max(float(-shift @ g), 0.0))
-                found.append(Moved(track.name, at, phi, length, float(np.linalg.norm(shift)), far))
-    return max(found, key=lambda one: one.deviations, default=None)
-
-
-def by_logs(solution: Solution) -> dict[str, tuple[float, float]]:
-    """What logs make of each value that is stated without a deviation, to first order, and the deviation."""
-    problem, values = solution.problem, values_of(solution.problem.nominal)
-    exact = [name for name, sigma in problem.stated.items() if not sigma and name not in problem.names]
-    columns: dict[str, FloatArray] = {}
-    for name in exact:
-        step = _STEP * max(abs(values[name]), PARAMETERS[name].scale)
-        up, down = (
-            residuals(replace(problem, held={**problem.held, name: value}), solution.x[None])[0]
-            for value in (values[name] + step, values[name] - step)
-        )
-        if np.any(up != down):
-            columns[name] = (up - down) / (2.0 * step)
-    found = zip(columns, _one_more(solution, columns.values()), strict=True)
-    return {name: (values[name] + one[0], one[1]) for name, one in found if one is not None}
-
-
-_MOMENTS = 20
-_LEAST_READINGS = 0.5
-"""Moments of a log at which a camera may have moved; noises of a reading, .2 px, below which it has not."""
-_MOVED_RAD, _MOVED_M = math.radians(0.1), 1e-4
-"""Turn and growth of the head up to which, before a fine camera, its move does no harm."""
-_STATED_OFF = 0.02
-_CROSSED, _BENDS_RAD = -0.5, 0.05
-_UNLIKE = 1.15
-"""Factor by which one of two pumps may be stronger, and the other weaker, than it should."""
-
-
-def crossed(solution: Solution) -> dict[str, float]:
-    """Correlation of angles with those of the model from which the fit began, by the name of a log.
-
-    Only of logs whose pumps push apart. The fit itself makes pumps weak that bend the rig the other way.
-    A controller pushes against what unlike pumps bend, so the largest correlation is taken of a model with
-    pumps alike and with either one stronger.
-    """
-    problem, found = solution.problem, {}
-    alike = dict(zip(STRENGTHS, problem.nominal.strength, strict=True))
-    one, other = STRENGTHS
-    for k, track in enumerate(problem.tracks):
-        if track.hoses:
-            delay_s, start = float(solution.x[problem.unknowns.delays[k]]), start_of(problem, solution.x, k)
-            pairs = [
-                problem.pair(track, {one: more * alike[one], other: alike[other] / more})
-                for more in (1.0, _UNLIKE, 1.0 / _UNLIKE)
-            ]
-            heads, _ = heads_of(track, pairs, [start] * len(pairs), delay_s)
-            both = [np.stack([head[:, 0], track.head[:, 0]]) for head in heads]
-            if np.isfinite(both).all() and np.ptp(both[0], axis=1).min() > _BENDS_RAD:
-                found[track.name] = max(float(np.corrcoef(pair)[0, 1]) for pair in both)
-    return found
-
-
-def _apart(solution: Solution, known: Uncertainty) -> Iterator[Finding]:
-    """What logs contradict: what is known, where the camera is, when rows come, which pump pushes where."""
-    raised = known.scale * max(known.inflation.values(), default=1.0)
-    stated = values_of(solution.problem.nominal)
-    for name, (value, sigma) in by_logs(solution).items():
-        off = abs(value - stated[name])
-        if off > max(_APART_SIGMA * raised * sigma, _STATED_OFF * abs(stated[name])):
-            label, spec = label_of(name), PARAMETERS[name]
-            # Far away the first order says no more than that it is another.
-            about = (
-                f"about {value:.4g} +- {raised * sigma:.2g}" if spec.low <= value <= spec.high else "another"
-            )
-            text = (
-                f"{label} is {stated[name]:.4g} {spec.unit}".rstrip() + f" in known, and {about} by the logs"
-            )
-            advice = "measure it and the mass again, or state its standard deviation under known"
-            yield Finding("inconsistent", text, advice)
-    # Logs move what is known beforehand by its deviation or two; a fit that ended beside the rig, or a wrong
-    # number, by ten.
-    unknowns = solution.problem.unknowns
-    for name, value, mean, sigma in zip(
-        solution.problem.names, solution.x, unknowns.mean, unknowns.sigma, strict=False
-    ):
-        if abs(value - mean) > _APART_SIGMA * sigma:
-            unit = f" {PARAMETERS[name].unit}".rstrip()
-            before, after = f"{mean:.4g} +- {sigma:.2g}{unit}", f"{value:.4g}{unit}"
-            text = (
-                f"{label_of(name)} is {before} beforehand, and {after} by the fit: another rig's number, or "
-                "a fit that ended beside the rig"
-            )
-            advice = (
-                "measure it and the mass again, and look at the stated gravity; where they are right, "
-                "identify with some logs left out"
-            )
-            yield Finding("inconsistent", text, advice)
-    moved, slow = moved_camera(solution), _slowly_commanded(solution.problem)
-    if (
-        moved is not None
-        and moved.name not in slow
-        and moved.readings > _LEAST_READINGS
-        and (abs(moved.phi_rad) > _MOVED_RAD or abs(moved.length_m) > _MOVED_M)
-        and moved.deviations > _APART_SIGMA * raised
-    ):
-        when, then = f"from about {moved.from_s:.1f} s on", "cut the log there, and"
-        if not moved.from_s:
-            when, then = "against those of the other logs", "keep it apart, and"
-        text = (
-            f"{moved.name}: its pictures are shifted {when}, as if the head had turned by "
-            f"{math.degrees(moved.phi_rad):+.1f} degrees and grown by {1e3 * moved.length_m:+.1f} mm; the "
-            "camera, or the marker on the head, has moved, or a pump answers otherwise"
-        )
-        advice = (
-            f"{then} calibrate the plane anew (calib extrinsics) for the pictures after that; where calib "
-            "replay finds that pictures and IMU agree, look at the pumps, their hoses and the commands' unit"
-        )
-        yield Finding("inconsistent", text, advice)
-    for name, alike in crossed(solution).items():
-        if alike < _CROSSED:
-            text = f"{name}: the head bends away from the pump that pushes, correlation {alike:.2f}"
-            advice = "look whether pwm1 and pwm2, or the hoses, are swapped, or the pictures are mirrored"
-            yield Finding("inconsistent", text, advice)
-    far = [
-        (abs(late) / sigma, name, late)
-        for name, late, sigma in own_delays(solution)
-        if abs(late) > max(_MOST_APART_S, _APART_SIGMA * raised * sigma)
-    ]
-    if far:
-        _, name, late = max(far)
-        when = "later" if late > 0.0 else "earlier"
-        text = (
-            f"{name}: its pictures come {1e3 * abs(late):.0f} ms {when} after its commands than those of the "
-            "other logs"
-        )
-        yield Finding("inconsistent", text, "compare the clocks of camera and commands, log by log")
-    late, sigma = pump_delay(solution) or (0.0, 1.0)
-    if abs(late) > max(_PUMPS_APART_S, _APART_SIGMA * raised * sigma):
-        one, other = ("pwm1", "pwm2") if late > 0.0 else ("pwm2", "pwm1")
-        text = (
-            f"{one} comes about {1e3 * abs(late):.0f} ms after {other}, as the rig answers them; the model "
-            "has one dead time for both pumps, so damping and lags are not the rig's"
-        )
-        yield Finding("inconsistent", text, "check the times of both columns, and hoses and valves")
-
-
-def _told(solution: Solution, known: Uncertainty) -> Iterator[Finding]:
-    """Which parameters logs do not tell, or hardly, and which a person states."""
-    for name, why in solution.fixed.items():
-        if "enter only" in why:
-            yield Finding("remark", why)
-        elif NO_CREEP in why:
-            yield Finding("remark", f"{label_of(name)}: {why}")
-        else:
-            text = f"{label_of(name)} is not identifiable from these logs: {why}"
-            yield Finding("unidentifiable", text)
-    most = max((float(track.pwm.max()) for track in solution.problem.tracks if track.hoses), default=0.0)
-    if 0.0 < most <= 100.0 and {*STRENGTHS} <= solution.fixed.keys():
-        unit = "unit: percent" if most > 1.0 else "factor: 255"
-        text = f"no command exceeds {most:.3g} of 255, below which the pumps give no force"
-        said = f"of other units, say pwm1: {{column: pwm1, {unit}}} in columns.yaml, and pwm2 so"
-        yield Finding("unidentifiable", text, said)
-    fixed = [label_of(name) for name, sigma in solution.problem.stated.items() if not sigma]
-    if fixed:
-        yield Finding("remark", f"not estimated, for known states it: {', '.join(fixed)}")
-    priors = [label_of(name) for name in solution.problem.names if solution.problem.stated.get(name)]
-    if priors:
-        yield Finding("remark", f"known with a standard deviation, which went in: {', '.join(priors)}")
-    for name, value in solution.values.items():
-        relative = known.sigma[name] / max(abs(value), 1e-12)
-        if relative > _MOST_RELATIVE:
-            so = f"known to {100.0 * relative:.0f} % only"
-            if relative > 1.0:
-                so = f"{value:.3g} +- {known.sigma[name]:.2g}: these logs do not tell it from zero"
-            if known.scatter[name] > _MOST_SCATTER:
-                times = f"{known.scatter[name]:.1f} times"
-                so += f"; stretches of the logs disagree on it, which raised its deviation {times}"
-            yield Finding("poor", f"{label_of(name)} is {so}")
-
-
-def _of_logs(solution: Solution, held: Sequence[HeldLog], next_ones: Sequence[Prospect]) -> Iterator[Finding]:
-    """How logs are met that were held back, the law of the pumps, and what to record next."""
-    for log in held:
-        # A log that alone tells a parameter is predicted badly by the others, who say nothing against it.
-        if log.held_phi_rad > _MOST_HELD * log.fitted_phi_rad + 1e-4 and log.chance < _LEAST_CHANCE:
-            text = (
-                f"{log.name}: held back, its angle is predicted to {1e3 * log.held_phi_rad:.3g} mrad, "
-                f"fitted to {1e3 * log.fitted_phi_rad:.3g} mrad, by parameters that the other logs contradict"
-            )
-            yield Finding("poor", text)
-    if solution.law:
-        yield Finding("remark", solution.law)
-    if not held and len(solution.problem.tracks) == 1:
-        yield Finding("remark", "one log alone: nothing is left to check the parameters on")
-    if next_ones:
-        best = next_ones[0]
-        advice = (
-            f"calib record PORT -o {best.name}.csv --do {best.name} ({best.what}) would leave "
-            f"{label_of(best.worst)} as the least known, to {100.0 * best.worst_relative:.2g} %"
-        )
-        yield Finding("remark", "", advice)
-
-
-def judge(
-    solution: Solution,
-    known: Uncertainty,
-    colours: Sequence[Colour],
-    held: Sequence[HeldLog],
-    next_ones: Sequence[Prospect],
-) -> Verdict:
-    """Judge an identification from what was computed of it."""
-    told, apart = _told(solution, known), _apart(solution, known)
-    fit, logs = _of_fit(solution, known, colours), _of_logs(solution, held, next_ones)
-    return Verdict.of([*told, *fit, *apart, *logs])

@@ -19,11 +19,12 @@ from calib.io.columns import is_arm_log
 from calib.io.logs import Log, check_time, read_log
 from calib.io.tables import read_cells
 from calib.solve.clock import clock_step_s
-from calib.stages.actuator.identify import Start, Track, without_outliers
+from calib.stages.actuator.identify import Start, Track
 from calib.stages.actuator.identify_pump import PumpRecord, PumpTable, Settled
 from calib.stages.actuator.kinematics import angle_and_length, bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import TICK_S, Plant
+from calib.stages.actuator.swing import without_outliers
 from calib.stages.control.laws import holding_force
 from calib.stages.estimator.read import periods, setup_from_rig
 from calib.stages.estimator.sensors import GRAVITY_MPS2, SIZE, heads_seen, marker

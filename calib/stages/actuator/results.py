@@ -18,24 +18,13 @@ from calib.solve.information import scaled_inverse
 from calib.stages.actuator.identify import (
     PARAMETERS,
     Colour,
-    Decrement,
-    HeldLog,
     Progress,
-    Prospect,
     Solution,
-    StiffnessFit,
     Track,
-    Uncertainty,
     colour_of,
-    decrement,
     elongation_polynomial,
     fit_tracks,
     head_of,
-    held_back,
-    judge,
-    prospects,
-    rms_by_track,
-    uncertainty,
     values_of,
 )
 from calib.stages.actuator.identify_pump import of_lag
@@ -52,6 +41,18 @@ from calib.stages.actuator.section import (
     PumpSection,
     in_force,
 )
+from calib.stages.actuator.springs import StiffnessFit
+from calib.stages.actuator.swing import Decrement, decrement
+from calib.stages.actuator.uncertainty import (
+    HeldLog,
+    Prospect,
+    Uncertainty,
+    held_back,
+    prospects,
+    rms_by_track,
+    uncertainty,
+)
+from calib.stages.actuator.verdict import judge
 
 
 @dataclass(frozen=True)

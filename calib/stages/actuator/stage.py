@@ -21,11 +21,12 @@ if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
     from calib.core.rig import Rig
     from calib.core.stage import Progress
-    from calib.stages.actuator.identify import Start, StiffnessFit, Track
+    from calib.stages.actuator.identify import Start, Track
     from calib.stages.actuator.identify_pump import Held, PumpFound, PumpTable
     from calib.stages.actuator.machine import Machine
     from calib.stages.actuator.results import Identified
     from calib.stages.actuator.section import Actuator, PumpSection
+    from calib.stages.actuator.springs import StiffnessFit
     from calib.stages.actuator.validate import Comparison
     from calib.stages.arm.identify import Errors
     from calib.stages.arm.model import Trial
@@ -362,8 +363,8 @@ def _read_stiffness(
 def _solve_stiffness(
     name: str, elongation_m: FloatArray, force_N: FloatArray, per: Literal["actuator", "bellows"], rig: Rig
 ) -> Actuator:
-    from calib.stages.actuator.identify import fit_stiffness
     from calib.stages.actuator.results import stiffness_section
+    from calib.stages.actuator.springs import fit_stiffness
 
     fits, best = fit_stiffness(name, elongation_m, force_N)
     section = stiffness_section(fits[best], per == "actuator", rig)

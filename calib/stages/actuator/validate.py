@@ -29,11 +29,12 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.options import LogOptions, PoseOptions
 from calib.core.rig import Rig
-from calib.stages.actuator.identify import Start, Track, heads_of, made, without_outliers
+from calib.stages.actuator.identify import Start, Track, heads_of, made
 from calib.stages.actuator.kinematics import angle_and_length, bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import Creep, Plant
 from calib.stages.actuator.read import held_by_pumps, read_track
+from calib.stages.actuator.swing import without_outliers
 
 if TYPE_CHECKING:
     from calib.core.stage import Files
