@@ -35,9 +35,10 @@ def convert(
     """
     import numpy as np
 
-    from calib.io.columns import COLUMNS_FILE, Passed
+    from calib.io.columns import COLUMNS_FILE
     from calib.io.logs import LOG, beside, iter_log, refuse_counts, within
     from calib.io.states import states_writer
+    from calib.io.tables import Passed
 
     check_log_name(output)
     note_inputs([log, *beside(log), *stated.files])

@@ -25,7 +25,8 @@ from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, package, pip_install
 from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown, to_be
 from calib.core.words import several
-from calib.io.columns import COLUMNS, Block, Passed
+from calib.io.columns import COLUMNS
+from calib.io.tables import Block, Passed
 
 # ----------------------------------------------------------------------
 # Which field of which topic of a bag is which column of a log.

@@ -10,9 +10,9 @@ import csv
 import io
 import math
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,7 +25,7 @@ from calib.core.files import one_line, read_bytes, read_text, shown
 from calib.core.options import LogOptions
 from calib.core.units import plain_number
 from calib.core.words import several
-from calib.io.columns import Block, ColumnMap, ColumnsFile, Passed, column_map, columns_file, known_name
+from calib.io.columns import ColumnMap, ColumnsFile, column_map, columns_file, known_name
 
 _BLOCK_BYTES = 1 << 20
 _LONGEST_LINE = 1 << 16
@@ -33,6 +33,88 @@ _MAX_COLUMNS = 1000
 _MOST_RECODED = 1 << 27
 _MOST_BYTES, _MOST_GROWTH = 1 << 28, 200
 """What a Parquet file may unpack to: so many bytes, or so many times its own size where that is more."""
+
+
+@dataclass(frozen=True)
+class Passed:
+    """What of a log's cells and rows was not taken as it stands.
+
+    Attributes
+    ----------
+    not_finite : cells that said nan or inf; in Parquet nan is a blank.
+    beyond : cells that hold more than any sensor gives. first : the first of them, in words.
+    clipped : readings at the end of their sensor's range. end : the first of them, in words.
+    outside : pictures that put the marker outside of them or at (0, 0).
+    truncated : whether the last line was cut short and left out.
+    wraps : how often the counter that is the time began again.
+    sorted : rows that stood below a later one, and were put where they belong.
+    twice : rows that say what the one before says, at its time, and were left out.
+    said : lines of words alone between the rows, as a board prints them.
+    damaged : lines that are no row, few among many. damage : what is wrong with the first of them.
+    times : what is odd about the times of a bag's messages, in words.
+    """
+
+    not_finite: int = 0
+    beyond: int = 0
+    first: str = ""
+    truncated: bool = False
+    wraps: int = 0
+    outside: int = 0
+    clipped: int = 0
+    end: str = ""
+    sorted: int = 0
+    twice: int = 0
+    said: int = 0
+    damaged: int = 0
+    damage: str = ""
+    times: str = ""
+
+    def __add__(self, later: Passed) -> Passed:
+        both = ((getattr(self, one.name), getattr(later, one.name)) for one in fields(self))
+        # Numbers add up; of words the first ones count.
+        return Passed(*(a + b if type(a) is int else a or b for a, b in both))
+
+    @property
+    def sentences(self) -> list[str]:
+        """One for each kind that there is."""
+        blank = "and count as blank"
+        kinds = (
+            (self.not_finite, f"{self.not_finite} cells say nan or inf {blank}"),
+            (self.beyond, f"{self.beyond} cells hold more than any sensor gives ({self.first}) {blank}"),
+            (self.outside, f"{self.outside} pictures put the marker outside of them or at (0, 0) {blank}"),
+            (
+                self.clipped,
+                f"{self.clipped} readings are at the end of a sensor's range ({self.end}) {blank}",
+            ),
+            (self.truncated, "the last line is cut short and left out"),
+            (self.wraps, f"the time begins again {self.wraps} times, as counters and days do; counted on"),
+            (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
+            (self.twice, f"{self.twice} rows are written twice; left out"),
+            (self.said, f"{self.said} lines between the rows hold words and no number; passed over"),
+            (self.damaged == 1, f"a line came damaged and is left out, {self.damage}"),
+            (
+                self.damaged > 1,
+                f"{self.damaged} lines came damaged and are left out, the first {self.damage}",
+            ),
+        )
+        return [sentence for there, sentence in (*kinds, (self.times, self.times)) if there]
+
+
+ALL_TAKEN = Passed()
+
+
+@dataclass(frozen=True)
+class Block:
+    """Cells of some rows as they are in the file, by column, `t_s` among them; NaN where one is blank.
+
+    Attributes
+    ----------
+    lines : (n,) number of each row's line, or of the row in a table without lines.
+    """
+
+    cells: Mapping[str, FloatArray]
+    lines: IntArray
+    passed: Passed = ALL_TAKEN
 
 
 @dataclass(frozen=True)

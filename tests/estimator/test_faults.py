@@ -12,7 +12,8 @@ from estimatorlogs import rows_from, setup_for, truth
 
 from calib.core.arrays import FloatArray
 from calib.core.verdict import Finding, Verdict
-from calib.io.logs import Log, Watch
+from calib.io.logs import Log
+from calib.io.sensor_faults import Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
 from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive, Handover
 from calib.stages.estimator.kinematic import OUT

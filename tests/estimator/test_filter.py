@@ -22,7 +22,7 @@ import calib.stages.actuator
 import calib.stages.estimator
 from calib.core.arrays import FloatArray, rms
 from calib.core.rig import Rig
-from calib.io.logs import Watch
+from calib.io.sensor_faults import Watch
 from calib.stages.actuator.kinematics import forward as forward_of_sensors
 from calib.stages.camera.model import Camera
 from calib.stages.estimator import reference, sensors, smoother

@@ -12,7 +12,9 @@ import pytest
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError
-from calib.io.logs import IN_PLANE, Log, Watch, read_log
+from calib.io.columns import IN_PLANE
+from calib.io.logs import Log, read_log
+from calib.io.sensor_faults import Watch
 
 G = 9.80665
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.logs import Log, held_places, unclipped
+from calib.io.logs import Log, unclipped
+from calib.io.sensor_faults import held_places
 from calib.stages.align.solve import ASIDE_M, AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
 from calib.stages.estimator.sensors import QUANTITIES, sensor_values, view_coefficients

@@ -33,9 +33,11 @@ from calib.core.stage import ProgressCall
 from calib.core.units import GRAVITY_MPS2
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.core.words import counted
-from calib.io.columns import BASELINE, STATES, Passed
-from calib.io.logs import Log, Watch
+from calib.io.columns import BASELINE, STATES
+from calib.io.logs import Log
+from calib.io.sensor_faults import Watch
 from calib.io.states import states_writer
+from calib.io.tables import Passed
 from calib.solve.clock import clock_step_s
 from calib.stages.estimator.baseline import Baseline
 from calib.stages.estimator.consistency import SENSORS, SETTLED_S, Tally

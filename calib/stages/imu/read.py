@@ -19,8 +19,8 @@ from calib.core.files import as_text, read_bytes, shown
 from calib.core.options import LogOptions
 from calib.core.rig import Rig
 from calib.core.verdict import Finding
-from calib.io.columns import ACCEL, GYRO
-from calib.io.logs import IMU, IN_PLANE, Log, Signals, log_of
+from calib.io.columns import ACCEL, GYRO, IMU, IN_PLANE
+from calib.io.logs import Log, Signals, log_of
 from calib.solve.clock import Part, time_axis
 from calib.solve.delay import delay_of
 from calib.stages.imu.drift import truth_late_s

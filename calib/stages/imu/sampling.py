@@ -13,7 +13,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.core.words import counted
-from calib.io.logs import clipped
+from calib.io.sensor_faults import clipped
 from calib.solve.clock import SPLIT_S, Gap, Part, time_axis
 from calib.stages.imu.levelling import GAP_S
 
