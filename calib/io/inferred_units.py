@@ -22,7 +22,7 @@ from calib.core.errors import BadInputError
 from calib.core.files import one_line
 from calib.core.geometry import rotation_exp
 from calib.core.units import GRAVITY_MPS2
-from calib.io.columns import ACCEL, GYRO, UNITS, ColumnMap, Source, kind_of, yaml_word
+from calib.io.columns import ACCEL, GYRO, MARKER, UNITS, ColumnMap, Source, kind_of, yaml_word
 
 _RATES_HZ = (4.0, 4000.0)
 _SLOWEST_S, _FASTEST_S = 0.9, 2e-5
@@ -56,7 +56,11 @@ _ARM = (0.07, 5.0)
 _MOST_EVIDENCE = 100_000
 
 
-def settled(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
+_ALIKE, _SECONDS_S = 4.0, 0.5
+"""Rows that share a stamp, and what is between two stamps, from which on nothing tells when a reading was."""
+
+
+def with_units(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
     """The map with all units, from what is stated and from the first readings of the log.
 
     Parameters
@@ -70,11 +74,12 @@ def settled(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
     """
     # Rows out of order are for whoever reads the log to refuse, and no sign of another unit.
     order = np.argsort(cells["t_s"][:_MOST_EVIDENCE], kind="stable")
-    cells = {name: values[order] for name, values in cells.items()}
+    first = _FirstReadings(columns, {name: values[order] for name, values in cells.items()})
     # Damaged files hold any number.
     with np.errstate(all="ignore"):
-        for step in (_with_time, _with_accel, _with_gyro):
-            columns = step(columns, cells)
+        for step in (_with_time_unit, _with_accel_unit, _with_gyro_unit):
+            first = step(first)
+    columns = first.map
     for column, source in columns.sources.items():
         if kind_of(column) and not source.unit:
             raise BadInputError(
@@ -85,77 +90,91 @@ def settled(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
 
 
 def _line(column: str, source: Source, unit: str) -> str:
+    """The line of columns.yaml that states a unit."""
     return f"{column}: {{column: {yaml_word(source.column)}, unit: {unit}}}"
 
 
-def _of(columns: ColumnMap, names: Sequence[str]) -> list[str]:
-    return [name for name in names if name in columns.sources]
+@dataclass(frozen=True)
+class _FirstReadings:
+    """The columns of a log, and its first cells (n,) by column as they are in the file, in order of time."""
 
+    map: ColumnMap
+    cells: Mapping[str, FloatArray]
 
-def _with(columns: ColumnMap, names: Sequence[str], unit: str, why: str) -> ColumnMap:
-    """The map with a unit for those of the columns that have none."""
-    known = {n: replace(columns.sources[n], unit=unit) for n in names if not columns.sources[n].unit}
-    evidence = {kind_of(names[0]): why} if known else {}
-    return replace(columns, sources={**columns.sources, **known}, evidence={**columns.evidence, **evidence})
+    def present(self, names: Sequence[str]) -> list[str]:
+        """Those of the columns that the log has."""
+        return [name for name in names if name in self.map.sources]
 
+    def units(self, names: Sequence[str]) -> set[str]:
+        """Units that somebody states for these columns."""
+        return {self.map.sources[name].unit for name in names} - {""}
 
-def _together(cells: Mapping[str, FloatArray], columns: ColumnMap, names: Sequence[str]) -> FloatArray:
-    """Rows (m, names) in which all of these columns have a reading, scaled but in the file's unit."""
-    values = np.stack(
-        [(cells[name] - columns.sources[name].offset) * columns.sources[name].factor for name in names],
-        axis=1,
-    )
-    return np.asarray(values[np.isfinite(values).all(axis=1)])
-
-
-_ALIKE, _SECONDS_S = 4.0, 0.5
-"""Rows that share a stamp, and what is between two stamps, from which on nothing tells when a reading was."""
-
-
-def _with_time(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
-    source = columns.sources["t_s"]
-    sensors = [cells[name] for name in _of(columns, (*ACCEL, *GYRO))] or [
-        cells[name] for name in _of(columns, ("u_px",))
-    ]
-    rows = (
-        np.isfinite(np.stack(sensors)).any(axis=0) if sensors else np.ones(len(cells["t_s"]), dtype=np.bool_)
-    )
-    steps = np.diff((cells["t_s"][rows]) * source.factor)
-    steps = steps[steps > 0.0]
-    units = UNITS["time"]
-    each = rows.sum() / (len(steps) + 1)
-    coarse_s = np.median(steps) * units.get(source.unit, 0.0) if len(steps) else 0.0
-    if each >= _ALIKE and coarse_s >= _SECONDS_S:
-        raise BadInputError(
-            f"{columns.source}: {one_line(source.column)[:40]} comes in steps of {coarse_s:.3g} s, each of "
-            f"which {each:.0f} rows share, expected the time of each reading; write it with six decimals, as "
-            "each reading is taken"
+    def rows(self, names: Sequence[str]) -> FloatArray:
+        """Rows (m, names) in which all of these columns have a reading, scaled but in the file's unit."""
+        sources = self.map.sources
+        values = np.stack(
+            [(self.cells[name] - sources[name].offset) * sources[name].factor for name in names], axis=1
         )
+        return np.asarray(values[np.isfinite(values).all(axis=1)])
+
+    def with_unit(self, names: Sequence[str], unit: str, evidence: str) -> _FirstReadings:
+        """The same with a unit for those of the columns that have none, and with what tells it."""
+        sources = self.map.sources
+        inferred = {n: replace(sources[n], unit=unit) for n in names if not sources[n].unit}
+        told = {kind_of(names[0]): evidence} if inferred else {}
+        known = replace(self.map, sources={**sources, **inferred}, evidence={**self.map.evidence, **told})
+        return replace(self, map=known)
+
+    def refused(self, text: str) -> BadInputError:
+        """The error that names the log."""
+        return BadInputError(f"{self.map.source}: {text}")
+
+    def advice(self, option: str, kind: str, unit: str) -> str:
+        """How a person states the unit of a kind of columns."""
+        return f"give --{option}-unit {unit} or add to {self.map.folder} the line units: {{{kind}: {unit}}}"
+
+
+def _with_time_unit(first: _FirstReadings) -> _FirstReadings:
+    source, units, cells = first.map.sources["t_s"], UNITS["time"], first.cells
+    name = one_line(source.column)[:40]
+    sensors = first.present((*ACCEL, *GYRO)) or first.present(("u_px",))
+    rows = np.ones(len(cells["t_s"]), dtype=np.bool_)
+    if sensors:
+        rows = np.logical_or.reduce([np.isfinite(cells[one]) for one in sensors])
+    steps = np.diff(cells["t_s"][rows] * source.factor)
+    steps = steps[steps > 0.0]
+    sharing = rows.sum() / (len(steps) + 1)
+    coarse_s = np.median(steps) * units.get(source.unit, 0.0) if len(steps) else 0.0
+    if sharing >= _ALIKE and coarse_s >= _SECONDS_S:
+        raise first.refused(
+            f"{name} comes in steps of {coarse_s:.3g} s, each of which {sharing:.0f} rows share, expected "
+            "the time of each reading; write it with six decimals, as each reading is taken"
+        )
+    if source.stated == "file":
+        return first
     step = float(np.median(steps)) if len(steps) >= _FEWEST else math.nan
     likely = [unit for unit, scale in units.items() if _RATES_HZ[0] <= 1.0 / (step * scale) < _RATES_HZ[1]]
     if source.unit:
-        if source.stated == "file":
-            return columns
-        if step * units[source.unit] > _SLOWEST_S or step * units[source.unit] < _FASTEST_S:
+        step_s = step * units[source.unit]
+        if step_s > _SLOWEST_S or step_s < _FASTEST_S:
             guess = likely[0] if likely else "ms"
-            rate = 1.0 / (step * units[source.unit])
-            raise BadInputError(
-                f"{columns.source}: {one_line(source.column)[:40]} steps by {step:.6g}, in {source.unit} "
-                f"that is {rate:.4g} samples/s, which no camera and no IMU of a rig has; if it is in "
-                f"{guess}, add to {columns.folder} the line {_line('t_s', source, guess)}"
+            raise first.refused(
+                f"{name} steps by {step:.6g}, in {source.unit} that is {1.0 / step_s:.4g} samples/s, which "
+                f"no camera and no IMU of a rig has; if it is in {guess}, add to {first.map.folder} the line "
+                f"{_line('t_s', source, guess)}"
             )
-        return columns
+        return first
     if not len(steps) and rows.sum() >= _FEWEST:
-        raise BadInputError(
-            f"{columns.source}: the time `{one_line(source.column)[:40]}` is {cells['t_s'][rows][0]:.10g} in "
-            "every row, expected it to advance; a program that saved it with few digits has to save all"
+        raise first.refused(
+            f"the time `{name}` is {cells['t_s'][rows][0]:.10g} in every row, expected it to advance; a "
+            "program that saved it with few digits has to save all"
         )
     if len(likely) != 1:
-        raise BadInputError(
-            f"{columns.source}: cannot tell the unit of the time `{one_line(source.column)[:40]}` from "
-            f"{len(steps)} steps; add to {columns.folder} the line {_line('t_s', source, 's|ms|us')}"
+        raise first.refused(
+            f"cannot tell the unit of the time `{name}` from {len(steps)} steps; add to {first.map.folder} "
+            f"the line {_line('t_s', source, 's|ms|us')}"
         )
-    return _with(columns, ["t_s"], likely[0], f"{1.0 / (step * units[likely[0]]):.4g} samples/s")
+    return first.with_unit(["t_s"], likely[0], f"{1.0 / (step * units[likely[0]]):.4g} samples/s")
 
 
 def calm_windows(values: FloatArray) -> FloatArray:
@@ -167,57 +186,50 @@ def calm_windows(values: FloatArray) -> FloatArray:
     return windows[np.argsort(loud, kind="stable")[: max(math.ceil(_CALM * len(windows)), 1)]]
 
 
-def _with_accel(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
-    names = _of(columns, ACCEL)
-    if not names or all(columns.sources[name].unit == "counts" for name in names):
-        return columns
-    values = _together(cells, columns, names)
-    stated = {columns.sources[name].unit for name in names} - {""}
-    if names[:2] != ["ax_mps2", "ay_mps2"] or len(values) < _FEWEST or len(stated) > 1:
-        return columns
-    if not values.any():
-        return columns
-    norm = float(np.median(np.linalg.norm(calm_windows(values), axis=2)))
-    bounds = _ABOUT_G if len(names) == 3 else _IN_PLANE_G
-    units = UNITS["accel"]
-    likely = [u for u in units if bounds[0] <= norm * units[u] / GRAVITY_MPS2 <= bounds[1] and u != "counts"]
-    found = f"the specific force is {norm:.4g} where the log is calm"
-    unit = next(iter(stated), "")
-    if not unit and len(likely) > 1:
+def _with_accel_unit(first: _FirstReadings) -> _FirstReadings:
+    names = first.present(ACCEL)
+    stated = first.units(names)
+    if names[:2] != ["ax_mps2", "ay_mps2"] or stated == {"counts"} or len(stated) > 1:
+        return first
+    values, unit = first.rows(names), next(iter(stated), "")
+    if len(values) < _FEWEST or not values.any():
+        return first
+    force = float(np.median(np.linalg.norm(calm_windows(values), axis=2)))
+    in_g = {u: force * scale / GRAVITY_MPS2 for u, scale in UNITS["accel"].items()}
+    least, most = _ABOUT_G if len(names) == 3 else _IN_PLANE_G
+    likely = [u for u, ratio in in_g.items() if least <= ratio <= most and u != "counts"]
+    found = f"the specific force is {force:.4g} where the log is calm"
+    if unit in likely or (not unit and len(likely) == 1):
+        return first.with_unit(names, likely[0], found)
+    advice = first.advice("acc", "accel", "|".join(likely))
+    if not unit and likely:
         # Two per cent lie between mg and cm/s^2, and more in how level a rig stands.
-        raise BadInputError(
-            f"{columns.source}: {found}, so it is in {' or in '.join(likely)}; "
-            f"{_advice('acc', 'accel', '|'.join(likely), columns)}"
-        )
-    if unit in ("", *likely) and likely:
-        return _with(columns, names, unit or likely[0], found)
-    least = 0.0 if len(names) == 2 else _STRANGE_G[0]
-    fits = bool(unit) and least <= norm * units[unit] / GRAVITY_MPS2 <= _STRANGE_G[1]
-    if likely and not (fits and len(names) == 2 and columns.sources[names[0]].stated != "name"):
-        advice = _advice("acc", "accel", "|".join(likely), columns)
-        raise BadInputError(
-            f"{columns.source}: {found}, so it is in {' or in '.join(likely)}, not in {unit}; {advice}"
-        )
-    if fits:
-        # Two axes may be far from the vertical, and a short log be never calm.
-        return columns
-    if norm < _NO_GRAVITY:
-        raise BadInputError(
-            f"{columns.source}: {found}, so that gravity is missing, as in a linear acceleration; expected "
-            "what an accelerometer feels, about 9.81 m/s^2 at rest"
+        raise first.refused(f"{found}, so it is in {' or in '.join(likely)}; {advice}")
+    # Two axes may be far from the vertical, and a short log be never calm.
+    flat = len(names) == 2
+    fits = bool(unit) and (0.0 if flat else _STRANGE_G[0]) <= in_g[unit] <= _STRANGE_G[1]
+    if likely and not (fits and flat and first.map.sources[names[0]].stated != "name"):
+        raise first.refused(f"{found}, so it is in {' or in '.join(likely)}, not in {unit}; {advice}")
+    if not fits:
+        raise first.refused(f"{found}{_no_force(first, names[0], force)}")
+    return first
+
+
+def _no_force(first: _FirstReadings, name: str, force: float) -> str:
+    """What is wrong with a specific force that is none in any unit, and what to do."""
+    if force < _NO_GRAVITY:
+        return (
+            ", so that gravity is missing, as in a linear acceleration; expected what an accelerometer "
+            "feels, about 9.81 m/s^2 at rest"
         )
     what = "no unit that is known here"
-    if norm > 150.0:
+    if force > 150.0:
         what = "raw counts, which calib imu intrinsics --acc-unit counts finds the scale of"
-    raise BadInputError(
-        f"{columns.source}: {found} ({what}), expected about 9.81 m/s^2; for a scale add to {columns.folder} "
-        f"a line for each axis, such as {names[0]}: {{column: {yaml_word(columns.sources[names[0]].column)}, "
-        f"factor: {GRAVITY_MPS2 / norm if norm > 0.0 else 1.0:.4g}}}"
+    return (
+        f" ({what}), expected about 9.81 m/s^2; for a scale add to {first.map.folder} a line for each axis, "
+        f"such as {name}: {{column: {yaml_word(first.map.sources[name].column)}, "
+        f"factor: {GRAVITY_MPS2 / force:.4g}}}"
     )
-
-
-def _advice(option: str, kind: str, unit: str, columns: ColumnMap) -> str:
-    return f"give --{option}-unit {unit} or add to {columns.folder} the line units: {{{kind}: {unit}}}"
 
 
 @dataclass(frozen=True)
@@ -287,63 +299,61 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
     return Turning(flat, by_force, by_gyro, spread, share, whole)
 
 
-def _with_gyro(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
-    names = _of(columns, GYRO)
-    if not names or all(columns.sources[name].unit == "counts" for name in names):
-        return columns
-    stated = {columns.sources[name].unit for name in names} - {""}
-    values = _together(cells, columns, names)
-    if len(stated) > 1 or len(values) < _FEWEST:
-        return columns
+def _with_gyro_unit(first: _FirstReadings) -> _FirstReadings:
+    names = first.present(GYRO)
+    stated = first.units(names)
+    if not names or stated == {"counts"} or len(stated) > 1 or len(first.rows(names)) < _FEWEST:
+        return first
     unit, scales = next(iter(stated), ""), {u: UNITS["gyro"][u] for u in ("rad/s", "deg/s", "mdeg/s")}
-    wrong = {u: _implausible(s, columns, cells, names, values) for u, s in scales.items()}
+    wrong = {u: _implausible(first, names, scale) for u, scale in scales.items()}
     likely = [u for u in ("rad/s", "deg/s") if not wrong[u]]
     if unit:
         if not wrong[unit]:
-            return columns
+            return first
         other = next((u for u in likely if u != unit), "deg/s" if unit == "rad/s" else "rad/s")
-        raise BadInputError(
-            f"{columns.source}: the gyroscope {wrong[unit]}, which none does in {unit}; if it is in {other}, "
-            f"{_advice('gyro', 'gyro', other, columns)}"
+        raise first.refused(
+            f"the gyroscope {wrong[unit]}, which none does in {unit}; if it is in {other}, "
+            f"{first.advice('gyro', 'gyro', other)}"
         )
     if len(likely) == 2:
-        wrong |= {u: _too_far(scales[u], columns, cells) for u in likely}
+        wrong |= {u: _too_far(first, scales[u]) for u in likely}
         likely = [u for u in likely if not wrong[u]] or likely
     # It makes small of nearly any readings, raw counts among them: the turns have to say so.
-    if not likely and not wrong["mdeg/s"] and _agrees(scales["mdeg/s"], columns, cells, names):
+    if not likely and not wrong["mdeg/s"] and _agrees(first, names, scales["mdeg/s"]):
         likely = ["mdeg/s"]
     if len(likely) == 1:
         others = "; ".join(f"in {u} it {wrong[u]}" for u in ("rad/s", "deg/s") if wrong[u])
-        return _with(columns, names, likely[0], others)
-    first = one_line(columns.sources[names[0]].column)[:40]
+        return first.with_unit(names, likely[0], others)
+    column = first.map.sources[names[0]].column
+    shown = one_line(column)[:40]
     if likely:
-        raise BadInputError(
-            f"{columns.source}: cannot tell whether `{first}` is in rad/s or in deg/s, as either is "
-            f"possible; {_advice('gyro', 'gyro', 'rad/s|deg/s', columns)}"
+        raise first.refused(
+            f"cannot tell whether `{shown}` is in rad/s or in deg/s, as either is possible; "
+            f"{first.advice('gyro', 'gyro', 'rad/s|deg/s')}"
         )
-    # That of an MPU6050 at its finest range.
-    scaled = f"{{column: {yaml_word(columns.sources[names[0]].column)}, unit: deg/s, factor: 0.00763}}"
-    raise BadInputError(
-        f"{columns.source}: `{first}` is neither in rad/s nor in deg/s. Of raw counts add to {columns.folder}"
-        f" a line for each axis with the data sheet's scale, such as {names[0]}: {scaled}; of mdeg/s "
-        f"{_advice('gyro', 'gyro', 'mdeg/s', columns)}"
+    # The scale is that of an MPU6050 at its finest range.
+    raise first.refused(
+        f"`{shown}` is neither in rad/s nor in deg/s. Of raw counts add to {first.map.folder} a line for "
+        f"each axis with the data sheet's scale, such as {names[0]}: {{column: {yaml_word(column)}, unit: "
+        f"deg/s, factor: 0.00763}}; of mdeg/s {first.advice('gyro', 'gyro', 'mdeg/s')}"
     )
 
 
-def _too_far(scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray]) -> str:
+def _too_far(first: _FirstReadings, scale: float) -> str:
     """Why rates about z cannot be in a unit of this many rad/s by the marker's motion; empty where they can.
 
     What turns with the head moves in the picture by its distance from the axis, which is neither a small part
     of the picture nor a multiple of it.
     """
-    if any(name not in columns.sources for name in ("gz_radps", "u_px", "v_px")):
+    cells, time = first.cells, first.map.sources["t_s"]
+    if len(first.present(("gz_radps", *MARKER))) < 3:
         return ""
-    t = cells["t_s"] * columns.sources["t_s"].factor * UNITS["time"][columns.sources["t_s"].unit]
+    t = cells["t_s"] * time.factor * UNITS["time"][time.unit]
     turns, seen = np.isfinite(cells["gz_radps"]), np.isfinite(cells["u_px"]) & np.isfinite(cells["v_px"])
     if min(turns.sum(), seen.sum()) < 2 * _CALM_WINDOW:
         return ""
     marker = np.stack([cells["u_px"][seen], cells["v_px"][seen]], axis=1)
-    rates = _together(cells, columns, ["gz_radps"])[:, 0]
+    rates = first.rows(["gz_radps"])[:, 0]
     angle = np.concatenate([[0.0], np.cumsum(scale * rates[1:] * np.diff(t[turns]))])
     # A constant gain and lag of the pictures play no part in what both do within a moment.
     times = np.arange(t[seen][0] + _LATEST_S, t[seen][-1] - _LATEST_S, _MOMENT_S / 4)
@@ -365,81 +375,96 @@ def _too_far(scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray]) 
     return f"turns a marker that would be {radius_px:.3g} px away from the axis"
 
 
-def _turns(
-    scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray], names: Sequence[str]
+def _compared_turns(
+    first: _FirstReadings, names: Sequence[str], scale: float
 ) -> tuple[Turning, FloatArray] | None:
     """How rates in a unit of this many rad/s turn beside the specific force, and the readings (n, axes) of
     both; None where there is no force in the plane or too little of both.
     """
-    accel = _of(columns, ACCEL)
+    accel = first.present(ACCEL)
     if "gz_radps" not in names or "ax_mps2" not in accel or "ay_mps2" not in accel:
         return None
-    every = _together(cells, columns, ["t_s", *accel, *names])
+    every = first.rows(["t_s", *accel, *names])
     every = every[(scale * np.abs(every[:, 1 + len(accel) :]) <= _FASTEST_RADPS).all(axis=1)]
     if len(every) < 2 * _CALM_WINDOW:
         return None
-    t = every[:, 0] * UNITS["time"][columns.sources["t_s"].unit]
+    t = every[:, 0] * UNITS["time"][first.map.sources["t_s"].unit]
     force, rates = every[:, 1 : 1 + len(accel)], every[:, 1 + len(accel) :]
-    whole = len(accel) == 3 and len(names) == 3
     others = [f for u, f in UNITS["gyro"].items() if u != "counts" and not math.isclose(f, scale)]
-    about = rates if whole else -rates[:, names.index("gz_radps")]
-    return turning(t, force, about, [scale, -scale, *others]), every[:, 1:]
+    if len(accel) < 3 or len(names) < 3:
+        rates = -rates[:, names.index("gz_radps")]
+    return turning(t, force, rates, [scale, -scale, *others]), every[:, 1:]
 
 
-def _agrees(scale: float, columns: ColumnMap, cells: Mapping[str, FloatArray], names: Sequence[str]) -> bool:
+def _agrees(first: _FirstReadings, names: Sequence[str], scale: float) -> bool:
     """Whether rates in a unit of this many rad/s turn as the specific force does."""
-    found = _turns(scale, columns, cells, names)
-    if found is None or not found[0].turned_rad > _LEAST_TURN_RAD:
+    compared = _compared_turns(first, names, scale)
+    if compared is None or not compared[0].turned_rad > _LEAST_TURN_RAD:
         return False
-    return min(found[0].misfit[scale], found[0].misfit[-scale]) < _AGREES
+    return min(compared[0].misfit[scale], compared[0].misfit[-scale]) < _AGREES
 
 
-def _implausible(
-    scale: float,
-    columns: ColumnMap,
-    cells: Mapping[str, FloatArray],
-    names: Sequence[str],
-    values: FloatArray,
-) -> str:
-    """Why rates (n, axes) cannot be in a unit of this many rad/s; empty where they can."""
+def _implausible(first: _FirstReadings, names: Sequence[str], scale: float) -> str:
+    """Why rates cannot be in a unit of this many rad/s; empty where they can."""
+    values = first.rows(names)
     # A few wild readings are a fault, not a unit.
     few = min(max(8, values.size // 100), values.size - 1)
     sizes = scale * np.sort(np.abs(values).ravel())
     if sizes[-1 - few] > _FASTEST_RADPS:
         return f"reaches {sizes[-1]:.4g} rad/s"
-    both = _turns(scale, columns, cells, names)
-    if both is None:
+    compared = _compared_turns(first, names, scale)
+    if compared is None:
         return ""
-    found, readings = both
-    mine = min(found.misfit[scale], found.misfit[-scale])
-    others = [share for factor, share in found.misfit.items() if abs(factor) != scale]
-    if found.turned_rad > _LEAST_TURN_RAD and mine > _AGREES and min(others, default=1.0) < _AGREES:
+    turns, readings = compared
+    calm = scale * calm_windows(readings)[:, :, -len(names) :]
+    spread = np.median(calm.std(axis=1), axis=0)
+    quietest = 0.0 if first.units(names) else _QUIETEST_RADPS
+    swing = scale * float(values.std(axis=0).max())
+    return _implausible_turns(turns, scale, spread) or (
+        _implausible_at_rest(calm, spread, swing, quietest) if turns.spread_rad < _REST_RAD else ""
+    )
+
+
+def _implausible_turns(turns: Turning, scale: float, spread: FloatArray) -> str:
+    """Why a gyroscope cannot turn so beside the specific force.
+
+    Parameters
+    ----------
+    spread : (axes,) of its readings where the log is calm [rad/s].
+    """
+    mine = min(turns.misfit[scale], turns.misfit[-scale])
+    others = [share for factor, share in turns.misfit.items() if abs(factor) != scale]
+    if turns.turned_rad > _LEAST_TURN_RAD and mine > _AGREES and min(others, default=1.0) < _AGREES:
         return "does not turn with the accelerometer's angle"
     # An accelerometer that is stuck says nothing about the gyroscope.
-    felt = found.by_force_rad > _LEAST_NOISE_RAD
-    least_rad = max(_LEAST_TURN_RAD, _FARTHER * found.by_force_rad)
-    calm = calm_windows(readings)[:, :, -len(names) :]
-    spread = scale * np.median(calm.std(axis=1), axis=0)
-    at_rest = found.spread_rad < _REST_RAD
+    felt = turns.by_force_rad > _LEAST_NOISE_RAD
     # At rest a gyroscope that is as quiet as one in this unit turns by its bias.
-    biased = at_rest and float(spread.max()) < _QUIET_RADPS
-    if felt and found.flat and not biased and scale * found.by_gyro_rad > least_rad:
-        times = scale * found.by_gyro_rad / max(found.by_force_rad, 1e-6)
-        # A pendulum's force hardly turns, in whatever unit: the sensor at its end feels the rod's alone.
-        as_other = [times * UNITS["gyro"][unit] / scale for unit in ("rad/s", "deg/s")]
-        if min(as_other) <= _FARTHER:
-            return f"turns {times:.3g} times as far as the accelerometer's angle"
-    if at_rest:
-        bias = scale * float(np.abs(np.median(calm, axis=(0, 1))).max())
-        # What goes to and fro by more is a swing of which the accelerometer feels nothing.
-        if bias > max(_LARGEST_BIAS_RADPS, scale * float(values.std(axis=0).max())):
-            return f"has a bias of {bias:.3g} rad/s at rest"
-        # A slow swing, which an accelerometer hardly feels, is no noise: that lives in differences as well.
-        rough = scale * np.median(np.diff(calm, 4, axis=1).std(axis=1), axis=0) / math.sqrt(70.0)
-        if ((spread > _LOUDEST_RADPS) & (rough > _ROUGH * spread)).any():
-            return f"is never quieter than {float(spread.max()):.3g} rad/s"
-        if 0.0 < float(spread.max()) < _QUIETEST_RADPS and not any(
-            columns.sources[name].unit for name in names
-        ):
-            return f"is as quiet as {float(spread.max()):.2g} rad/s"
+    biased = turns.spread_rad < _REST_RAD and float(spread.max()) < _QUIET_RADPS
+    least_rad = max(_LEAST_TURN_RAD, _FARTHER * turns.by_force_rad)
+    if not felt or not turns.flat or biased or not scale * turns.by_gyro_rad > least_rad:
+        return ""
+    times = scale * turns.by_gyro_rad / max(turns.by_force_rad, 1e-6)
+    # A pendulum's force hardly turns, in whatever unit: the sensor at its end feels the rod's alone.
+    as_other = [times * UNITS["gyro"][unit] / scale for unit in ("rad/s", "deg/s")]
+    return f"turns {times:.3g} times as far as the accelerometer's angle" if min(as_other) <= _FARTHER else ""
+
+
+def _implausible_at_rest(calm: FloatArray, spread: FloatArray, swing: float, quietest: float) -> str:
+    """Why a gyroscope at rest cannot read so.
+
+    Parameters
+    ----------
+    calm : (windows, size, axes) its calm readings. spread : (axes,) theirs. swing : that of all readings.
+    quietest : least spread of a gyroscope. All in rad/s.
+    """
+    bias = float(np.abs(np.median(calm, axis=(0, 1))).max())
+    # What goes to and fro by more is a swing of which the accelerometer feels nothing.
+    if bias > max(_LARGEST_BIAS_RADPS, swing):
+        return f"has a bias of {bias:.3g} rad/s at rest"
+    # A slow swing, which an accelerometer hardly feels, is no noise: that lives in differences as well.
+    rough = np.median(np.diff(calm, 4, axis=1).std(axis=1), axis=0) / math.sqrt(70.0)
+    if ((spread > _LOUDEST_RADPS) & (rough > _ROUGH * spread)).any():
+        return f"is never quieter than {float(spread.max()):.3g} rad/s"
+    if 0.0 < float(spread.max()) < quietest:
+        return f"is as quiet as {float(spread.max()):.2g} rad/s"
     return ""

@@ -52,7 +52,7 @@ from calib.io.columns import (
     kind_of,
     own_unit,
 )
-from calib.io.inferred_units import settled
+from calib.io.inferred_units import with_units
 from calib.io.sensor_faults import FEWEST, Watch, clipped, marker_places
 from calib.io.tables import (
     ALL_TAKEN,
@@ -216,7 +216,7 @@ def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
     first = next((block for block in blocks if len(block.lines)), None)
     if first is None:
         return
-    known = settled(columns, first.cells)
+    known = with_units(columns, first.cells)
     unknown = known.unknown
     for block in chain([first], blocks):
         named = {n: known.sources[n].si(kind_of(n), v) for n, v in block.cells.items() if n != "t_s"}

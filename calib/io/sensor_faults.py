@@ -74,8 +74,8 @@ class Watch:
     held: list[tuple[int, int]] = field(default_factory=list)
     _seen: dict[str, tuple[int, float, float]] = field(default_factory=dict)
     _mirrored: Finding | None = None
-    _known: bool = False
-    _unmoved: Finding | None = None
+    _sign_known: bool = False
+    _silent: Finding | None = None
     _stopped: Finding | None = None
     _stuck: Finding | None = None
 
@@ -89,9 +89,9 @@ class Watch:
             self._seen[name] = count + len(finite), least, most
         self._stuck = self._stuck or _frozen(log, self.names)
         if all(name in log.columns and name in self.names for name in IN_PLANE):
-            if not self._known:
-                self._known, self._mirrored = _mirrored(log)
-            self._unmoved = self._unmoved or _unmoved(log)
+            if not self._sign_known:
+                self._sign_known, self._mirrored = _mirrored(log)
+            self._silent = self._silent or _silent_gyro(log)
         self.held = _held(log) if set(self.names) & set(IMU) else []
         self._stopped = self._stopped or _stopped(log, self.held)
 
@@ -116,7 +116,7 @@ class Watch:
         more = (
             self._stopped,
             self._stuck or self._mirrored,
-            self._unmoved if alive and not self._stuck else None,
+            self._silent if alive and not self._stuck else None,
         )
         return [*out, *(one for one in more if one is not None)]
 
@@ -178,13 +178,11 @@ def _stopped(log: Rows, held: Sequence[tuple[int, int]]) -> Finding | None:
     return Finding("poor", f"{text}; they tell nothing", _CHECK_IMU)
 
 
-def _unmoved(log: Rows) -> Finding | None:
+def _silent_gyro(log: Rows) -> Finding | None:
     """Where the accelerometer moves and the gyroscope is stuck, or does not answer its turns.
 
-    For the latter both angles are averaged over half a second and compared about their straight lines over
-    five seconds, which take a bias out; a line that is steeper than a bias is a turn. A sensor that is
-    carried without turning feels its acceleration, whose velocity stays small. Of a sensor that tilts the
-    angle turns about all three axes (`calib.stages.imu.tracks`); far out of the plane it is none.
+    Of a sensor that tilts the angle turns about all three axes (`calib.stages.imu.tracks`); far out of the
+    plane it is none.
     """
     tilts = "az_mps2" in log.columns
     if tilts and not all(name in log.columns for name in IMU):
@@ -201,22 +199,41 @@ def _unmoved(log: Rows) -> Finding | None:
         rate = rate + az * (gx * ax + gy * ay) / np.maximum(across, 1e-9)
         upright &= across > _UPRIGHT * (across + az * az)
     turned = np.cumsum(rate * np.diff(t_s, prepend=t_s[0]))
-    edges = np.flatnonzero(np.diff(gz, prepend=np.nan, append=np.nan) != 0.0)
+    return _stuck_gyro(t_s, gz, leant, upright) or _unanswered_turns(t_s, leant, turned, upright)
+
+
+def _stuck_gyro(
+    t_s: FloatArray, gz_radps: FloatArray, leant_rad: FloatArray, upright: BoolArray
+) -> Finding | None:
+    """Where rates (n,) stay the same for long while the accelerometer's angle (n,) shakes."""
+    edges = np.flatnonzero(np.diff(gz_radps, prepend=np.nan, append=np.nan) != 0.0)
     long = np.flatnonzero(np.diff(edges) >= FEWEST)
     for a, b in zip(edges[long].tolist(), edges[long + 1].tolist(), strict=True):
         lasting = t_s[b - 1] - t_s[a] >= _STUCK_S and upright[a:b].mean() > 0.9
-        if lasting and float(leant[a:b].std()) > _SHAKEN_RAD:
+        if lasting and float(leant_rad[a:b].std()) > _SHAKEN_RAD:
             return Finding(
                 "inconsistent",
-                f"gz_radps is stuck at {gz[a]:.6g} from {t_s[a]:.1f} to {t_s[b - 1]:.1f} s, where the "
+                f"gz_radps is stuck at {gz_radps[a]:.6g} from {t_s[a]:.1f} to {t_s[b - 1]:.1f} s, where the "
                 "accelerometer moves",
                 _CHECK_GYRO,
             )
+    return None
+
+
+def _unanswered_turns(
+    t_s: FloatArray, leant_rad: FloatArray, turned_rad: FloatArray, upright: BoolArray
+) -> Finding | None:
+    """Where the accelerometer's angle (n,) turns and the gyroscope's (n,) does not.
+
+    Both are averaged over half a second and compared about their straight lines over five seconds, which take
+    a bias out; a line that is steeper than a bias is a turn. A sensor that is carried without turning feels
+    its acceleration, whose velocity stays small.
+    """
     starts = np.flatnonzero(np.diff(np.floor((t_s - t_s[0]) / _BIN_S), prepend=-1.0))
     size = np.diff(np.append(starts, len(t_s)))
     if len(starts) < _BINS:
         return None
-    bins = np.stack([np.add.reduceat(x, starts) / size for x in (t_s, leant, turned, upright)])
+    bins = np.stack([np.add.reduceat(x, starts) / size for x in (t_s, leant_rad, turned_rad, upright)])
     windows = np.lib.stride_tricks.sliding_window_view(bins, _BINS, axis=1).transpose(1, 0, 2)
     t, angles, flat = windows[:, 0], windows[:, 1:3], windows[:, 3].min(axis=1) > 0.9
     flat &= t[:, -1] - t[:, 0] < 2.0 * _BINS * _BIN_S
@@ -224,9 +241,9 @@ def _unmoved(log: Rows) -> Finding | None:
     angles = angles - angles.mean(axis=2, keepdims=True)
     slope = np.einsum("wt,wat->wa", k, angles) / np.maximum((k * k).sum(axis=1), 1e-12)[:, None]
     angles = angles - slope[:, :, None] * k[:, None, :]
-    felt_rad, turned_rad = angles.std(axis=2).T
+    by_accel_rad, by_gyro_rad = angles.std(axis=2).T
     carried_mps = GRAVITY_MPS2 * _BIN_S * np.cumsum(angles[:, 0], axis=1).std(axis=1)
-    felt, answered = flat & (felt_rad > _FELT_RAD), turned_rad >= _ANSWERED * felt_rad
+    felt, answered = flat & (by_accel_rad > _FELT_RAD), by_gyro_rad >= _ANSWERED * by_accel_rad
     still = (carried_mps > _CARRIED_MPS) & (np.abs(slope[:, 1]) < _MOST_BIAS_RADPS)
     dead = np.flatnonzero(felt & ~answered & still)
     # In hours of handling some push looks like a turn: in few windows, or between turns that are answered.
@@ -234,11 +251,11 @@ def _unmoved(log: Rows) -> Finding | None:
         return None
     if np.count_nonzero((felt & answered)[dead[0] : dead[-1]]) > len(dead):
         return None
-    most = dead[np.argmax(felt_rad[dead])]
+    most = dead[np.argmax(by_accel_rad[dead])]
     return Finding(
         "inconsistent",
         f"gz_radps does not turn from {t_s[starts[dead[0]]]:.1f} s on where the accelerometer's angle "
-        f"turns, by {math.degrees(felt_rad[most]):.2g} deg at about {t[most].mean():.0f} s",
+        f"turns, by {math.degrees(by_accel_rad[most]):.2g} deg at about {t[most].mean():.0f} s",
         _CHECK_GYRO,
     )
 

@@ -204,7 +204,7 @@ def _parsed(text: _Text, data: bytes, first_line: int) -> tuple[Block, int]:
         every = data.split(b"\n")[:-1]
         rows = [n for n, line in enumerate(every) if line.strip() and not line.lstrip().startswith(b"#")]
         data, lines = b"".join(every[n] + b"\n" for n in rows), lines[rows]
-    return _by_pyarrow(text, data, lines) or _by_lines(text, data, lines), first_line + count
+    return _parsed_by_pyarrow(text, data, lines) or _parsed_by_line(text, data, lines), first_line + count
 
 
 def _timed(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Block]:
@@ -221,7 +221,7 @@ def _timed(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Block]:
         yield block
 
 
-def _by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
+def _parsed_by_pyarrow(text: _Text, data: bytes, lines: IntArray) -> Block | None:
     """The rows by pyarrow; None where it declines, or may see other rows than there are lines."""
     import pyarrow
     from pyarrow import csv as arrow_csv
@@ -282,18 +282,18 @@ def _blanked(values: FloatArray) -> int:
     return int(np.count_nonzero(infinite))
 
 
-def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
-    """The rows line by line; what a board says between is no row, nor is one in `_SOUND` that is damaged.
+def _parsed_by_line(text: _Text, data: bytes, lines: IntArray) -> Block:
+    """The rows line by line; what a board says between is no row, nor is a damaged line where few are.
 
     Raises `BadInputError` with a sentence for what cannot be read.
     """
     values = np.empty((len(lines), len(text.slots)))
     passed, taken = Passed(), np.ones(len(lines), dtype=np.bool_)
     first: BadInputError | None = None
-    spared = max(len(lines) // _SOUND, int(len(lines) > 0 and lines[0] > _SOUND))
+    spared = max(len(lines) // _ROWS_PER_DAMAGED, int(len(lines) > 0 and lines[0] > _ROWS_PER_DAMAGED))
     for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
         words = raw.decode("utf-8", "replace").rstrip("\r")
-        if _is_said(text, words):
+        if _is_prose(text, words):
             taken[row], passed = False, passed + Passed(said=1)
             continue
         try:
@@ -310,7 +310,7 @@ def _by_lines(text: _Text, data: bytes, lines: IntArray) -> Block:
     return Block(cells_of, lines, passed + Passed(odd, damage=damage))
 
 
-_SOUND = 200
+_ROWS_PER_DAMAGED = 200
 """One row in so many may be damaged, as a serial line damages them."""
 
 
@@ -326,7 +326,7 @@ def _row(text: _Text, words: str, line: int) -> list[float]:
     return [_number(text, cells[slot], name, line) for name, slot in text.slots.items()]
 
 
-def _is_said(text: _Text, line: str) -> bool:
+def _is_prose(text: _Text, line: str) -> bool:
     """Whether a line begins with a word and has no number in any cell."""
     if not _WORD.match(line):
         return False
@@ -342,7 +342,7 @@ def _separator(line: str) -> str:
     return ","
 
 
-def _mark(line: str) -> str:
+def _separator_of_log(line: str) -> str:
     """The mark between the cells of a log's first line, which may be blanks."""
     mark, words = _separator(line), line.split()
     if mark != "," or "," in line or len(words) < 3:
@@ -360,43 +360,12 @@ def _numeric(cells: Sequence[str], separator: str) -> bool:
 
 
 def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
-    """How the text is made up, the beginning of its rows, which was read on the way, and their line.
-
-    The header is the first line that is neither blank nor a comment.
-    """
+    """How the text is made up, the beginning of its rows, which was read on the way, and their line."""
     file = columns_file(path, options)
-    line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
-    while raw.endswith(b"\n") and (
-        not raw.strip() or raw.lstrip(b"\xef\xbb\xbf \t").startswith((b"#", b"//"))
-    ):
-        comment = raw.decode("utf-8-sig", "replace").lstrip("#%/ \t").rstrip("\r\n") or comment
-        line, raw = line + 1, stream.readline(_LONGEST_LINE)
-    ahead, above = b"", ""
-    if not _is_header(raw, file):
-        first, lines = raw, list(_lines_up_to_a_header(stream, file))
-        if lines and _is_header(lines[-1], file):
-            # What a board or a terminal says before the table.
-            line, raw = line + len(lines), lines[-1]
-            said = one_line(first.decode("utf-8", "replace").strip())[:40]
-            above = f"the table from line {line} on, below `{said}`"
-        else:
-            ahead = b"".join(lines)
+    line, raw, comment, ahead, above = _first_line(stream, file)
     where, head = f"{source}, line {line}", _decoded(raw)
-    if not raw.strip():
-        raise BadInputError(f"{source}: is empty, expected a header and rows")
-    if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
-        raise BadInputError(f"{where}: has more than {_LONGEST_LINE} characters, expected a header")
-    if not _is_header(raw, file):
-        try:
-            raw.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise BadInputError(
-                f"{where}: is not UTF-8 text (byte {error.start}), expected a header; save a spreadsheet as "
-                "CSV, unpack what is packed"
-            ) from error
-    if "\0" in head:
-        raise BadInputError(f"{where}: has a zero byte, expected a text file")
-    separator = (file and file.separator) or _mark(head)
+    _check_is_text(source, where, raw, file)
+    separator = (file and file.separator) or _separator_of_log(head)
     names = head.split() if separator == " " else _split(where, head.rstrip("\r\n"), separator)
     if len(names) > _MAX_COLUMNS:
         raise BadInputError(f"{where}: has {len(names)} columns, expected at most {_MAX_COLUMNS}")
@@ -411,15 +380,54 @@ def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> t
         names = [*names, ""]
     elif len(cells) == len(names) - 1 and not names[-1].strip():
         names = names[:-1]
-    columns = column_map(source, path, line, names, file, options)
+    columns = replace(column_map(source, path, line, names, file, options), above=above)
     comma = separator != "," and bool(re.search(r"(?:^|[\s;])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?:$|[\s;])", head))
     decimal = (file and file.decimal) or ("," if comma else ".")
     time = columns.sources["t_s"].column
     dates = bool(time) and _has_dates(cells, columns.names.index(time))
-    if above:
-        columns = replace(columns, above=above)
     text = _Text(source, _with_dates(columns) if dates else columns, separator, decimal, dates)
     return text, start, line if rows else line + 1
+
+
+def _first_line(stream: BinaryIO, file: ColumnsFile | None) -> tuple[int, bytes, str, bytes, str]:
+    """The header, or the first row of a table without: its number and bytes.
+
+    That is the first line that is neither blank nor a comment, unless a header follows within `_MOST_ABOVE`
+    lines: what a board or a terminal says stands above it. Then come the last comment, the lines that were
+    read beyond, and in words where the table begins, where something stands above it.
+    """
+    line, comment, raw = 1, "", stream.readline(_LONGEST_LINE)
+    while raw.endswith(b"\n") and (
+        not raw.strip() or raw.lstrip(b"\xef\xbb\xbf \t").startswith((b"#", b"//"))
+    ):
+        comment = raw.decode("utf-8-sig", "replace").lstrip("#%/ \t").rstrip("\r\n") or comment
+        line, raw = line + 1, stream.readline(_LONGEST_LINE)
+    if _is_header(raw, file):
+        return line, raw, comment, b"", ""
+    following = list(_lines_up_to_a_header(stream, file))
+    if not following or not _is_header(following[-1], file):
+        return line, raw, comment, b"".join(following), ""
+    line += len(following)
+    said = one_line(raw.decode("utf-8", "replace").strip())[:40]
+    return line, following[-1], comment, b"", f"the table from line {line} on, below `{said}`"
+
+
+def _check_is_text(source: str, where: str, raw: bytes, file: ColumnsFile | None) -> None:
+    """Raise `BadInputError` where the first line (`where`) of a file is none of a text table."""
+    if not raw.strip():
+        raise BadInputError(f"{source}: is empty, expected a header and rows")
+    if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
+        raise BadInputError(f"{where}: has more than {_LONGEST_LINE} characters, expected a header")
+    if not _is_header(raw, file):
+        try:
+            raw.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise BadInputError(
+                f"{where}: is not UTF-8 text (byte {error.start}), expected a header; save a spreadsheet as "
+                "CSV, unpack what is packed"
+            ) from error
+    if b"\0" in raw:
+        raise BadInputError(f"{where}: has a zero byte, expected a text file")
 
 
 _MOST_ABOVE = 50
@@ -446,7 +454,9 @@ def _decoded(raw: bytes) -> str:
 def _is_header(raw: bytes, file: ColumnsFile | None) -> bool:
     """Whether a line names the time and another column, or three columns."""
     text = _decoded(raw).strip()
-    names = [name.strip().strip('"') for name in text.split((file and file.separator) or _mark(text))]
+    names = [
+        name.strip().strip('"') for name in text.split((file and file.separator) or _separator_of_log(text))
+    ]
     stated = {one.column: column for column, one in file.sources.items()} if file else {}
     known = [(stated[name],) if name in stated else known_name(name) for name in names]
     found = {one[0] for one in known if one is not None}
