@@ -18,6 +18,7 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.columns import QUATERNION, is_arm_log, known_name
 from calib.io.logs import Log, read_log
+from calib.stages.arm.frame import check_frame, frame_findings, frame_of, trial_of
 from calib.stages.arm.identify import (
     FULL,
     _coverage,
@@ -45,8 +46,8 @@ from calib.stages.arm.model import (
     segment_run,
     values_on,
 )
-from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
-from calib.stages.arm.stage import _far
+from calib.stages.arm.recording import recording_of
+from calib.stages.arm.stage import _outlying_trials
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +210,7 @@ def test_a_trial_apart_is_poor_where_it_matters(error_deg: float, severity: str)
     errors = {"a": error_deg, "b": 0.4, "c": 0.4, "d": 0.4}
     held = {name: {"angle_rad": math.radians(error)} for name, error in errors.items()}
     found = SimpleNamespace(held=held, fit=SimpleNamespace(scale=replace(SCALE, angle_rad=1.0)))
-    (finding,) = _far(found)
+    (finding,) = _outlying_trials(found)
     assert finding.severity == severity
     assert finding.text.startswith(f"a is predicted to {error_deg:.1f} deg from the others")
 
@@ -357,10 +358,10 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
     assert np.flatnonzero(np.isnan(recording.turned[0, :, 0])).tolist() == [700]
     assert any("line 702: motion capture jumps by 2." in text for text in texts)
     fast = columns_of(replace(trial, angle_rad=0.4 + 0.4 * np.sin(5.0 * trial.t_s)))
-    assert "jumps" not in _said(fast, trial)
+    assert "jumps" not in _findings(fast, trial)
 
 
-def _said(columns: dict[str, FloatArray], trial: Trial) -> str:
+def _findings(columns: dict[str, FloatArray], trial: Trial) -> str:
     return "; ".join(
         f"{one.severity}: {one.text}" for one in recording_of(_log(columns, trial), "a").findings
     )
@@ -385,13 +386,13 @@ def _said(columns: dict[str, FloatArray], trial: Trial) -> str:
 def test_a_signal_that_freezes_while_others_move_is_told(column: str, least_s: float, words: str) -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)
-    assert "frozen" not in _said(columns | {"p2_kpa": trial.t_s, "p3_kpa": trial.t_s}, trial)
+    assert "frozen" not in _findings(columns | {"p2_kpa": trial.t_s, "p3_kpa": trial.t_s}, trial)
     rows = slice(500, 501 + round(50 * least_s))
     for name in columns:
         if name.startswith(column):
             columns[name] = columns[name].copy()
             columns[name][rows] = columns[name][500]
-    assert words in _said(columns, trial)
+    assert words in _findings(columns, trial)
 
 
 @pytest.mark.parametrize(("falls_s", "frozen"), [(10.0, False), (25.0, True)])
@@ -402,7 +403,7 @@ def test_an_arm_that_settles_slowly_under_a_held_command_is_sound(falls_s: float
     settles = replace(
         trial, command=np.where(t < 10.0, 200.0, 7.0), pressure_kpa=200.0 * moves, angle_rad=0.5 * moves
     )
-    assert ("command stands still" in _said(columns_of(settles), settles)) == frozen
+    assert ("command stands still" in _findings(columns_of(settles), settles)) == frozen
 
 
 def test_a_command_that_nobody_knows_and_a_place_that_jumps_are_told() -> None:
@@ -410,11 +411,11 @@ def test_a_command_that_nobody_knows_and_a_place_that_jumps_are_told() -> None:
     columns = columns_of(trial)
     columns["p_cmd1_kpa"] = np.where(np.abs(trial.t_s - 20.0) < 2.0, np.nan, trial.command)
     columns["tip_y_m"] = columns["tip_y_m"] + 0.02 * (trial.t_s > 30.0)
-    said = _said(columns, trial)
+    said = _findings(columns, trial)
     assert "poor: a: has no command from 18.0 to 22.0 s, which a free run needs" in said
     changes = np.diff(trial.command, prepend=np.nan) != 0.0
     sparse = columns_of(trial) | {"p_cmd1_kpa": np.where(changes, trial.command, np.nan)}
-    assert "has no command" not in _said(sparse, trial)
+    assert "has no command" not in _findings(sparse, trial)
     assert "line 1503: motion capture jumps by 20" in said
 
 
@@ -526,18 +527,18 @@ def test_units_that_no_arm_has_are_told() -> None:
         except BadInputError as error:
             said = [str(error)]
         assert any(words in text for text in said)
-    assert "as psi would" not in _said(columns, trial)
-    assert "as psi would" in _said(columns | {"p1_kpa": columns["p1_kpa"] / 6.895}, trial)
+    assert "as psi would" not in _findings(columns, trial)
+    assert "as psi would" in _findings(columns | {"p1_kpa": columns["p1_kpa"] / 6.895}, trial)
 
 
 def test_pressures_from_vacuum_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)
-    assert "vacuum" not in _said(columns, trial)
+    assert "vacuum" not in _findings(columns, trial)
     # One that nobody vents and that stays below its command need not.
     held = replace(trial, pressure_kpa=102.0 + 0.4 * trial.pressure_kpa)
-    assert "vacuum" not in _said(columns_of(held), held)
-    assert "poor: a: its pressure is 10" in _said(columns | {"p1_kpa": columns["p1_kpa"] + 101.3}, trial)
+    assert "vacuum" not in _findings(columns_of(held), held)
+    assert "poor: a: its pressure is 10" in _findings(columns | {"p1_kpa": columns["p1_kpa"] + 101.3}, trial)
 
 
 def test_poses_of_zeros_were_not_seen() -> None:

@@ -16,15 +16,15 @@ from calib.core.verdict import Finding, Verdict
 if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.words import Block
+    from calib.stages.arm.frame import Frame
     from calib.stages.arm.identify import Identification
     from calib.stages.arm.model import Trial
-    from calib.stages.arm.read import Frame
     from calib.stages.arm.section import Arm
 
 _FEWEST = 3
-_UNTOLD = 0.8
+_UNIDENTIFIED = 0.8
 """Posterior over prior deviation above which logs tell nothing of a parameter."""
-_FAR = 2.0
+_OUTLYING = 2.0
 """A held trial is far from the others with this many times their median error."""
 _ODD = 0.05
 """Of the angle's range: an error far from the others' that is smaller only widens the interval of a trial."""
@@ -55,7 +55,7 @@ class Options(LogOptions):
     )
 
 
-def _said(words: Iterable[str], flag: str, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+def _stated(words: Iterable[str], flag: str, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Names of logs and what is stated of them. Raises `UsageError` for names that are none."""
     for one in words:
         pattern, _, value = one.partition("=")
@@ -78,18 +78,19 @@ def read_trials(
 
     Raises
     ------
-    BadInputError as `calib.stages.arm.read`; `UsageError` for statements about logs that are not there.
+    BadInputError as `recording_of`, `frame_of`, `trial_of`; `UsageError` for statements about other logs.
     """
     from calib.core.units import parse_mass_kg
     from calib.io.logs import read_log
-    from calib.stages.arm.read import check_frame, frame_findings, frame_of, recording_of, trial_of
+    from calib.stages.arm.frame import check_frame, frame_findings, frame_of, trial_of
+    from calib.stages.arm.recording import recording_of
 
     names = [path.stem for path in files.named]
     if len(set(names)) < len(names):
         raise UsageError(f"logs: {', '.join(names)} are not all different, expected a name for each")
-    loads = {n: parse_mass_kg(mass, "--load") for n, mass in _said(options.load or (), "--load", names)}
+    loads = {n: parse_mass_kg(mass, "--load") for n, mass in _stated(options.load or (), "--load", names)}
     days = {name: name.rpartition("_")[0] or name for name in names}
-    days |= dict(_said(options.day or (), "--day", names))
+    days |= dict(_stated(options.day or (), "--day", names))
     used = {path.stem for path in files.paths}
     recordings = []
     for path in files.paths:
@@ -151,18 +152,26 @@ def _solve(
 
 def judge(found: Identification) -> Iterator[Finding]:
     """What the held trials, the baselines and the posterior say of an identification."""
-    from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
-    from calib.stages.arm.model import COMPLIANCE, DAILY, load_bends
-
     if not any(len(one.angle_rad) for one in found.trials):
         yield Finding("poor", "no log has a pose, so the valve alone is identified", "log base and tip")
         return
+    for rule in _RULES:
+        yield from rule(found)
+
+
+def _few_trials(found: Identification) -> Iterator[Finding]:
     if len(found.trials) < _FEWEST:
         yield Finding(
             "poor",
             f"{len(found.trials)} trials do not tell how trials differ, expected at least {_FEWEST}",
             "record more trials: other commands, another day",
         )
+
+
+def _beside_black_boxes(found: Identification) -> Iterator[Finding]:
+    from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
+
+    scale = found.fit.scale
     for quantity, one in QUANTITIES.items():
         name = best_baseline(found, quantity)
         mean, half = gained(found, name, quantity) if name else (math.nan, math.nan)
@@ -172,10 +181,14 @@ def judge(found: Identification) -> Iterator[Finding]:
             f"{one.words}: error on held trials {100.0 * abs(mean):.0f} +- {100.0 * half:.0f} % "
             f"{'smaller' if mean > 0.0 else 'larger'} than that of {name} (paired, 95 %)"
         )
-        scale = found.fit.scale
         size = scale.chord_m if quantity == "chord_m" else scale.angle_rad
         worse = -mean * mean_of(found.others[name], quantity) > _MATTERS * size
         yield Finding("poor" if worse else "remark", text)
+
+
+def _coarse_prediction(found: Identification) -> Iterator[Finding]:
+    from calib.stages.arm.identify import mean_of
+
     error, size = mean_of(found.held, "angle_rad"), found.fit.scale.angle_rad
     if error > _COARSE * size:
         yield Finding(
@@ -184,7 +197,25 @@ def judge(found: Identification) -> Iterator[Finding]:
             f"{math.degrees(size):.0f} deg",
             "look at the logs' days, loads and units",
         )
-    yield from _far(found)
+
+
+def _outlying_trials(found: Identification) -> Iterator[Finding]:
+    errors = {name: one["angle_rad"] for name, one in found.held.items()}
+    for name, error in errors.items():
+        others = sorted(x for n, x in errors.items() if n != name and math.isfinite(x))
+        if len(others) < _FEWEST - 1:
+            continue
+        usual = others[len(others) // 2]
+        if error - usual >= _LEAST_RAD and error > _OUTLYING * usual:
+            yield Finding(
+                "poor" if error > _ODD * found.fit.scale.angle_rad else "remark",
+                f"{name} is predicted to {math.degrees(error):.1f} deg from the others, which reach "
+                f"{math.degrees(usual):.1f} deg: it alone holds its day, load or range",
+                f"record another trial like {name}",
+            )
+
+
+def _no_pressure(found: Identification) -> Iterator[Finding]:
     if all(one.pwm and not len(one.pressure_kpa) for one in found.trials):
         yield Finding(
             "remark",
@@ -192,23 +223,61 @@ def judge(found: Identification) -> Iterator[Finding]:
             f"{found.fit.scale.pressure_kpa:.0f} kPa",
             "log p1_kpa, where they matter",
         )
-    yield from _untold(found)
+
+
+def _unidentified(found: Identification) -> Iterator[Finding]:
+    from calib.stages.arm.model import PARAMETERS, PARTS
+
+    sigmas = zip(PARAMETERS, found.fit.sigma.tolist(), strict=True)
+    vague = {parameter.name for parameter, sigma in sigmas if sigma > _UNIDENTIFIED}
+    names: dict[str, None] = {}
+    takes: dict[str, None] = {}
+    for part in PARTS:
+        mine = [one for one in part.parameters if one.name in vague and part.name in found.fit.assembly.parts]
+        whole = len(mine) == len(part.parameters)
+        names |= dict.fromkeys([part.name] if whole else [one.name for one in mine])
+        takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
+    if names:
+        yield Finding(
+            "remark", f"{', '.join(names)}: the prior's, these logs do not tell; it takes {', '.join(takes)}"
+        )
+    if "load" not in found.fit.assembly.parts:
+        yield Finding(
+            "remark",
+            "area, stiffness and lever arm are one number, bends_rad_per_kpa, without a known load",
+            "record a trial with a known mass at the tip and state it with --load",
+        )
+
+
+def _one_day(found: Identification) -> Iterator[Finding]:
+    from calib.stages.arm.model import DAILY
+
     if len({one.day for one in found.trials}) == 1:
         share = DAILY["bends_rad_per_kpa"]
         yield Finding(
             "remark",
             f"all trials are of one day: on another the angle may well differ by {100.0 * share:.0f} %, "
-            f"{math.degrees(share * size):.0f} deg at the most, which the interval of a trial does not hold",
+            f"{math.degrees(share * found.fit.scale.angle_rad):.0f} deg at the most, which the interval of a "
+            "trial does not hold",
             "record trials on another day, too, and state it with --day where names do not tell",
         )
+
+
+def _load_straightens(found: Identification) -> Iterator[Finding]:
+    from calib.stages.arm.model import COMPLIANCE, load_bends
+
     values = found.fit.values
-    middle = values["rest_rad"] + 0.5 * size
-    if load_bends(middle, *(values[name] for name in COMPLIANCE)) < 0.0:
+    middle_rad = values["rest_rad"] + 0.5 * found.fit.scale.angle_rad
+    if load_bends(middle_rad, *(values[name] for name in COMPLIANCE)) < 0.0:
         yield Finding(
             "remark",
             "a load straightens the arm, as it does one that hangs or bends upwards",
             "where the arm stands upright look whether --load names the trials with the mass at the tip",
         )
+
+
+def _vented_starts(found: Identification) -> Iterator[Finding]:
+    values = found.fit.values
     for trial in found.trials:
         if not len(trial.angle_rad):
             continue
@@ -221,43 +290,17 @@ def judge(found: Identification) -> Iterator[Finding]:
             )
 
 
-def _far(found: Identification) -> Iterator[Finding]:
-    errors = {name: one["angle_rad"] for name, one in found.held.items()}
-    for name, error in errors.items():
-        others = sorted(x for n, x in errors.items() if n != name and math.isfinite(x))
-        if len(others) < _FEWEST - 1:
-            continue
-        usual = others[len(others) // 2]
-        if error - usual >= _LEAST_RAD and error > _FAR * usual:
-            yield Finding(
-                "poor" if error > _ODD * found.fit.scale.angle_rad else "remark",
-                f"{name} is predicted to {math.degrees(error):.1f} deg from the others, which reach "
-                f"{math.degrees(usual):.1f} deg: it alone holds its day, load or range",
-                f"record another trial like {name}",
-            )
-
-
-def _untold(found: Identification) -> Iterator[Finding]:
-    from calib.stages.arm.model import PARAMETERS, PARTS
-
-    vague = {p.name for p, s in zip(PARAMETERS, found.fit.sigma.tolist(), strict=True) if s > _UNTOLD}
-    untold: dict[str, None] = {}
-    takes: dict[str, None] = {}
-    for part in PARTS:
-        mine = [one for one in part.parameters if one.name in vague and part.name in found.fit.assembly.parts]
-        whole = len(mine) == len(part.parameters)
-        untold |= dict.fromkeys([part.name] if whole else [one.name for one in mine])
-        takes |= dict.fromkeys(one.identified_by for one in (mine[:1] if whole else mine))
-    if untold:
-        yield Finding(
-            "remark", f"{', '.join(untold)}: the prior's, these logs do not tell; it takes {', '.join(takes)}"
-        )
-    if "load" not in found.fit.assembly.parts:
-        yield Finding(
-            "remark",
-            "area, stiffness and lever arm are one number, bends_rad_per_kpa, without a known load",
-            "record a trial with a known mass at the tip and state it with --load",
-        )
+_RULES = (
+    _few_trials,
+    _beside_black_boxes,
+    _coarse_prediction,
+    _outlying_trials,
+    _no_pressure,
+    _unidentified,
+    _one_day,
+    _load_straightens,
+    _vented_starts,
+)
 
 
 def _words(arm: Arm) -> list[Block]:
@@ -325,8 +368,8 @@ def held_trials(files: Files, arm: Arm, options: Options) -> Sequence[Trial]:
     """Trials to hold an arm against, in its plane. Raises `BadInputError` as `read_trials`."""
     import numpy as np
 
+    from calib.stages.arm.frame import Frame
     from calib.stages.arm.model import DAILY
-    from calib.stages.arm.read import Frame
 
     axis = arm.bending_axis
     if options.load and "load" not in arm.parts:
