@@ -32,7 +32,7 @@ from calib.core.result import Section
 from calib.core.rig import Rig
 from calib.core.schema import validated
 from calib.core.units import unit_of
-from calib.core.words import as_words
+from calib.core.words import as_words, several
 from calib.core.workers import Processes, Task, at_most
 from calib.core.writing import make_folder
 from calib.io.tables import read_cells
@@ -136,12 +136,14 @@ class RigSpec:
     source : absolute path of its folder, or a URL.
     serial : as written, "" without.
     options : of its camera, by name.
+    written : its folder or URL as the manifest has it, without secrets: the same wherever the fleet lies.
     """
 
     name: str
     source: str
     serial: str = ""
     options: tuple[tuple[str, str], ...] = ()
+    written: str = ""
 
 
 @dataclass(frozen=True)
@@ -242,7 +244,7 @@ def _rig(where: str, row: Mapping[str, Any], root: Path) -> RigSpec:
     except CalibError as error:
         raise BadInputError(f"{where}: {told.name}: {error}") from error
     source = told.path if is_url(told.path) else str(root / told.path)
-    return RigSpec(told.name, source, told.serial, options)
+    return RigSpec(told.name, source, told.serial, options, without_secrets(told.path))
 
 
 def camera_options(options: Iterable[tuple[str, str]]) -> dict[str, str]:
@@ -437,6 +439,7 @@ def _code(done: Calibrated, kind: str) -> int:
 # Nothing is kept between rigs and nothing is written but scratch, so that a rig that is tried again,
 # elsewhere or later, gives the same bytes.
 
+_FETCHED = "fetched"
 _MOST_KEPT_BYTES = 30_000_000
 _STATUS = {EXIT_DONE: "ok", EXIT_POOR: "poor", EXIT_INTERNAL: "broken"}
 
@@ -465,12 +468,14 @@ def calibrate_rig(spec: RigSpec, options: FleetOptions, known: str = "") -> Answ
     with contextlib.suppress(OSError):
         # 5 makes the kernel forget the largest memory so far (proc(5), clear_refs).
         Path("/proc/self/clear_refs").write_text("5")
-    began = time.perf_counter()
+    began, place = time.perf_counter(), ""
     try:
         with tempfile.TemporaryDirectory(prefix="rig-") as place:
             answer = _calibrated(spec, options, known, Path(place))
     except Exception as error:
         code, sentence = end_of(error)
+        for folder in (f"{place}/{_FETCHED}", spec.source):
+            sentence = sentence.replace(shown(folder), spec.written)
         answer = Answer(
             Outcome(name=spec.name, status=_STATUS.get(code, "failed"), code=code, sentence=sentence)
         )
@@ -486,7 +491,7 @@ def reasons_of(ended: Sequence[Job]) -> tuple[str, ...]:
 
 
 def _calibrated(spec: RigSpec, options: FleetOptions, known: str, place: Path) -> Answer:
-    root = local_folder(spec.source, place / "fetched", allowed=options.allowed)
+    root = local_folder(spec.source, place / _FETCHED, allowed=options.allowed)
     folder = read_folder(root)
     kind = kind_of(folder)
     inputs = {folder.name_of(path): digest for path, digest in folder_digests(folder).items()}
@@ -565,6 +570,10 @@ def run_fleet(
     limit_s: float = LIMIT_S,
 ) -> Counter[str]:
     """Run all rigs whose results are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
+    named = {spec.name for spec in manifest.rigs}
+    if others := {path.name for path in (store.out / "rigs").glob("*")} - named:
+        left = several(sorted(map(one_line, others)))
+        tell(f"rigs/: holds results of an earlier run of what the manifest does not name: {left}")
     tasks = (
         Task(spec.name, calibrate_rig, (spec, options, store.known(spec.name)), limit_s)
         for spec in manifest.rigs
@@ -638,7 +647,7 @@ def _row_of(rig: RigSpec, outcome: Outcome) -> dict[str, Any]:
     row: dict[str, Any] = {
         "name": rig.name,
         "serial": rig.serial,
-        "source": without_secrets(rig.source),
+        "source": rig.written,
         "kind": outcome.kind,
         "simulated": outcome.simulated,
         "verdict": outcome.status,
@@ -860,7 +869,8 @@ _MOST_LOOKS = 200
 _MOST_STANDING_OUT = 20
 _ORDER = {"broken": 0, "lost": 0, "failed": 1, "poor": 3, "ok": 4}
 _MATRIX = re.compile(r"\[\d+\]\[\d+\]$")
-_SETTINGS = ("image_size_px[", ".views", ".points", ".pictures", "lens.region_px[", "distance_m")
+# What a lens does in its region is one thing around a plane's workspace and another in the picture's middle.
+_SETTINGS = ("image_size_px[", ".views", ".points", ".pictures", "lens.region_", "distance_m")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from calib.core.files import sha256
 from calib.core.result import CovarianceTable
 from calib.core.rig import Provenance, Rig
 from calib.core.workers import Failure, Task
+from calib.core.writing import make_folder
 from calib.runner.fleet import (
     FleetOptions,
     Manifest,
@@ -51,19 +52,22 @@ def test_failures_are_rows_and_what_is_there_is_left_alone(tmp_path: Path) -> No
         (images / "a.png").write_bytes(b"no picture %d" % k)
         (images / "day1").mkdir()
         specs.append(RigSpec(f"rig{k}", str(images.parent), str(k)))
-    specs.append(RigSpec("gone", str(tmp_path / "none")))
+    specs.append(RigSpec("gone", str(tmp_path / "none"), written="rigs/none"))
     manifest, said = Manifest(tuple(specs), ()), list[str]()
     with opened_store(tmp_path / "out", "calib fleet", ()) as (store, _):
         first = run_fleet(store, Here(), manifest, FleetOptions(), tell=said.append)
         assert first == {"failed": 6}
-        assert any(sentence.startswith("gone: failed (") for sentence in said) and len(said) == 11
+        # Tables and page do not say where the fleet lies.
+        assert any(one.startswith("gone: failed (rigs/none: is not") for one in said) and len(said) == 11
         assert "rig0: images/: day1 left out, folders are not looked into" in said
         found = store.outcome("rig2")
         assert found is not None and found.code == 3
         # Bad input is bad input again; a folder that was not there may be there now.
         (tmp_path / "rig1" / "images" / "a.png").write_bytes(b"another")
-        again = run_fleet(store, Here(), manifest, FleetOptions())
-        assert again == {"same": 4, "failed": 2}
+        # A rig that was renamed leaves its results behind.
+        make_folder(tmp_path / "out" / "rigs" / "rig9")
+        again = run_fleet(store, Here(), manifest, FleetOptions(), tell=said.append)
+        assert again == {"same": 4, "failed": 2} and said[11].endswith("does not name: rig9")
 
 
 def test_a_rig_that_failed_says_first_what_has_failed() -> None:

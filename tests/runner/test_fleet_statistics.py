@@ -112,6 +112,7 @@ def _fleet(count: int, seed: int = 0) -> list[tuple[RigSpec, Outcome]]:
             "camera.cx_px": (160.0 + 0.5 * rng.standard_normal() + 9.0 * (k == 7), 0.1),
             "camera.views": (6.0 + k % 2, None),
             "plane.R_CW[0][0]": (rng.standard_normal(), None),
+            "lens.region_mean_px": (0.5 + 0.01 * rng.standard_normal() - 0.3 * (k % 10 == 0), None),
             "camera.skew_px": (0.0, None),
         }
         status, code = ("failed", 3) if k == 3 else ("poor", 1) if k == 5 else ("ok", 0)
