@@ -30,7 +30,7 @@ def main(page: Path) -> int:
             browser.open(page, NARROW_PX)
             wide = int(browser.run("document.documentElement.scrollWidth"))
             mute = int(
-                browser.run("[...document.querySelectorAll('.canvas')].filter((c) => !c.ariaLabel).length")
+                browser.run("[...document.querySelectorAll('figure')].filter((c) => !c.ariaLabel).length")
             )
             sheets = len(re.findall(rb"/Type\s*/Page\b(?!s)", browser.pdf()))
             errors = list(browser.errors)

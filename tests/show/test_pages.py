@@ -236,6 +236,11 @@ def test_dark_light_print_and_keyboard(rig: Path, browser: Browser) -> None:
     browser.key("Tab", 9)
     assert browser.run("document.activeElement.className") == "skip"
     assert browser.pdf().startswith(b"%PDF")
+    browser.run(_TO_EACH)
+    # Nothing that the Tab key reaches is hidden from a screen reader.
+    tools = "document.querySelectorAll('.modebar button').length"
+    hidden = "document.querySelectorAll('[aria-hidden=true] button, [role=img] button').length"
+    assert browser.run(tools) >= 6 and browser.run(hidden) == 0
     named = [
         node for node in browser.accessible() if node["role"]["value"] in ("button", "image", "link", "img")
     ]

@@ -151,8 +151,9 @@
     drawn.set(place, look);
     const chart = JSON.parse(place.querySelector("script").textContent);
     Plotly.react(place.querySelector(".canvas").firstChild, ...build(chart, width), config);
-    // What the library measures letters with is nothing to read.
-    document.getElementById("js-plotly-tester")?.setAttribute("aria-hidden", "true");
+    // The caption tells what is drawn; ticks, and what the library measures letters with, are nothing to read.
+    const drawings = [...place.querySelectorAll(".main-svg, .modebar svg"), document.getElementById("js-plotly-tester")];
+    for (const one of drawings) one?.setAttribute("aria-hidden", "true");
   };
   const places = [...document.querySelectorAll(".chart")];
   const seen = new IntersectionObserver((entries) => {
@@ -165,8 +166,8 @@
   const again = () => { for (const place of drawn.keys()) draw(place); };
   document.getElementById("theme").addEventListener("click", again);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
-  // On paper a chart has the width of a wide window, whatever window it is printed from.
-  const PRINTED_PX = 960;
-  addEventListener("beforeprint", () => { for (const place of places) if (place.clientWidth) draw(place, PRINTED_PX); });
+  // On paper a chart has one width, whatever window it is printed from; the style shrinks it to its column.
+  const printed = (place) => place.closest(".card") ? 440 : 960;
+  addEventListener("beforeprint", () => { for (const place of places) if (place.clientWidth) draw(place, printed(place)); });
   addEventListener("afterprint", again);
 })();

@@ -677,6 +677,6 @@ def _world_axes(camera: Camera, plane: Plane) -> list[plot.Mark]:
     for end, name, colour, align in axes:
         marks.append(plot.Arrows(ends[:1], end[None] - ends[:1], colour=colour))
         u, v = ends[0] + 1.06 * (end - ends[0])
-        marks.append(plot.Text(u, v, f"{name}, {1e3 * length:g} mm", colour, align, bold=True))
+        marks.append(plot.Text(u, v, f"{name}, {1e3 * length:g} mm", align=align, bold=True))
     u, v = ends[0] - 0.02 * size.max()
     return [*marks, plot.Text(u, v, "middle" if start.any() else "origin", align="right")]
