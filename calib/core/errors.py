@@ -52,6 +52,10 @@ class BadInputError(CalibError):
     """Something that was read is not what it has to be; the message names file, line or key."""
 
 
+class UnknownKeyError(BadInputError):
+    """A file has a key that nothing reads."""
+
+
 class CopyError(BadInputError):
     """A file holds what another one holds that was read, which would count twice."""
 

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticCustomError
 
-from calib.core.errors import BadInputError
+from calib.core.errors import BadInputError, UnknownKeyError
 from calib.core.files import one_line, quoted, shown
 from calib.core.units import plain_number, unit_of
-from calib.core.words import nearest
+from calib.core.words import counted, nearest
 
 Kind = TypeVar("Kind", bound=BaseModel)
 
@@ -41,6 +41,7 @@ _EXPECTED = {
 }
 """What pydantic's kinds of error ask for, in words."""
 
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 _OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 _MOST = 1e40
@@ -65,13 +66,14 @@ def validated(kind: type[Kind], values: Any, source: Path | str, key: str = "") 
     ----------
     source : the file's name, and key : where in it the values stand, for the sentence.
 
-    Raises `BadInputError` for the first thing that is wrong.
+    Raises `BadInputError` for the first thing that is wrong, `UnknownKeyError` for a key.
     """
     _refuse_endless(values, source, key)
     try:
         return kind.model_validate(values)
     except ValidationError as error:
-        raise BadInputError(f"{shown(source)}: {_sentence(kind, error, key)}") from error
+        raised = UnknownKeyError if error.errors()[0]["type"] in _UNKNOWN else BadInputError
+        raise raised(f"{shown(source)}: {_sentence(kind, error, key)}") from error
 
 
 def _refuse_endless(value: Any, source: Path | str, key: str) -> None:
@@ -100,7 +102,7 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
     if how == "missing":
         made_up = "; calib writes it, and of a section that you make up it is ok"
         return f"{key} is missing{made_up if place[-1] == 'verdict' else ''}"
-    if how in ("extra_forbidden", "unexpected_keyword_argument"):
+    if how in _UNKNOWN:
         return f"{key} is not a key that is known here{nearest(str(place[-1]), around.get('properties', {}))}"
     message = first["msg"]
     expected = message[0].lower() + message[1:]
@@ -108,8 +110,10 @@ def _sentence(kind: type[BaseModel], error: ValidationError, under: str) -> str:
         expected = expected.removeprefix(lead)
     expected = _EXPECTED.get(how, expected)
     if how in ("too_short", "too_long"):
-        limit = first["ctx"].get("min_length", first["ctx"].get("max_length"))
-        expected = f"{limit} values"
+        limit = first["ctx"]["min_length" if how == "too_short" else "max_length"]
+        exact = part.get("minItems") == part.get("maxItems")
+        words = "" if exact else "at least " if how == "too_short" else "at most "
+        expected = words + counted(limit, "value")
     elif how in _OUT_OF_RANGE and isinstance(value, int | float):
         expected = _range(part, _unit(place), value)
         return f"{key} is {value:g}, expected {expected}"

@@ -21,11 +21,11 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, end_of
+from calib.core.errors import EXIT_INTERNAL, BadInputError, CalibError, UnknownKeyError, end_of
 from calib.core.files import one_line, quoted, read_text, read_yaml_mapping, sha256, shown
 from calib.core.plot import every
 from calib.core.result import Number, Pair, Section
-from calib.core.rig import SCHEMA, Rig
+from calib.core.rig import SCHEMA, VERBS, Rig
 from calib.core.schema import contradiction, validated
 from calib.core.units import parse_duration_s
 from calib.core.words import short
@@ -35,6 +35,7 @@ from calib.runner.cache import program
 from calib.stages.control.trial import control_model, run_controller
 from calib.stages.control.tuning import Tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
+from calib.twin.scenarios import SCENARIOS
 
 # ----------------------------------------------------------------------
 # The specification of a sweep: what is run, over which parameters, and what is measured.
@@ -60,6 +61,8 @@ from calib.twin.rig import SimulatedRig, rig_from_file
 _SECTIONS = (
     "actuator", "pump", "twin", "controller", "estimator", "align", "imu", "imu_intrinsics", "scenario",
 )  # fmt: skip
+_PLANT = ("actuator", "pump", "twin")
+_HERE = Path("the sweep")
 _GAINS = {"orientation": "tuned-pid", "position": "tuned-pd", "computed_torque": "torque"}
 _MOST_CASES = 200_000
 _LONGEST_S = 3600.0
@@ -261,7 +264,6 @@ def _problems(spec: Sweep) -> Iterator[str]:
     """What does not fit together, in sentences."""
     from calib.stages.control.references import BUILT_IN
     from calib.stages.control.trial import CONTROLLERS
-    from calib.twin.scenarios import SCENARIOS
 
     base = spec.base
     wanted: dict[str, tuple[str, tuple[str, ...]]] = {"scenario": (base.scenario, tuple(SCENARIOS))}
@@ -269,6 +271,10 @@ def _problems(spec: Sweep) -> Iterator[str]:
         wanted = {"controller": (base.name, CONTROLLERS), "reference": (base.other, BUILT_IN)}
     if not base.name:
         yield "base names none of controller, scenario, filter"
+    if base.controller and (base.filter or base.scenario):
+        yield f"base has a controller and a {'filter' if base.filter else 'scenario'}, expected one of them"
+    if base.reference and not base.controller:
+        yield "base.reference is that of a controller, and base has none"
     for key, (name, names) in wanted.items():
         if name not in names:
             yield f"base.{key} is {quoted(name)}, expected one of {', '.join(names)}"
@@ -278,7 +284,7 @@ def _problems(spec: Sweep) -> Iterator[str]:
     except CalibError as error:
         yield str(error)
     for key in spec.names:
-        yield from _problems_of(key, base)
+        yield from _problems_of(key, spec.axes.get(key, [0.0])[0], base)
     twice = next((key for key in spec.grid if key in spec.draws.parameters), None)
     if twice is not None:
         yield f"{twice} is in grid and in draws, expected it in one of them"
@@ -290,8 +296,8 @@ def _problems(spec: Sweep) -> Iterator[str]:
         yield f"asks for {spec.cases} cases, expected no more than {_MOST_CASES}"
 
 
-def _problems_of(key: str, base: Base) -> Iterator[str]:
-    """What is wrong with a parameter: nothing would read it."""
+def _problems_of(key: str, value: Any, base: Base) -> Iterator[str]:
+    """What is wrong with a parameter, of which `value` is one: nothing would read it."""
     section, _, rest = key.partition(".")
     if not _KEY.fullmatch(key) or section not in _SECTIONS:
         listed = ", ".join(_SECTIONS)
@@ -302,8 +308,18 @@ def _problems_of(key: str, base: Base) -> Iterator[str]:
         yield f"{key} needs a controller, and base has a {base.kind}"
     if section == "controller" and (whose := _GAINS.get(rest.split(".")[0], base.name)) != base.name:
         yield f"{key} belongs to the controller {whose}, and base has {base.name}"
-    if section == "controller" and "controller" not in _parsed(base.rig):
-        yield f"{key} is in the section controller, which base.rig lacks; calib control tune writes it"
+    if section not in (*_PLANT, "scenario") and section not in _parsed(base.rig):
+        yield f"{key} is in the section {section}, which base.rig lacks; calib {VERBS[section]} writes it"
+    try:
+        if section == "scenario":
+            validated(SCENARIOS[base.scenario], {rest: value}, _HERE, section)
+        else:
+            Rig.of(_document(base.rig, {key: value}), _HERE)
+    except UnknownKeyError as error:
+        yield str(error).removeprefix(f"{_HERE}: ")
+    except BadInputError:
+        # Another value may be one: a case that has none is a row.
+        pass
 
 
 # ----------------------------------------------------------------------
@@ -311,9 +327,6 @@ def _problems_of(key: str, base: Base) -> Iterator[str]:
 #
 # This module runs the twin on purpose: the plant is the base rig with a case's parameters, while controllers
 # and filters know the base rig, but for gains and noise that are parameters themselves.
-
-_PLANT = ("actuator", "pump", "twin")
-_HERE = Path("the sweep")
 
 
 def measured(case: Case, base: Base, seed: int, key: str, known: str) -> outcomes.Answer:
