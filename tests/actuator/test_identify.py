@@ -959,7 +959,27 @@ def test_pumps_that_are_on_already_are_seen_by_the_pose() -> None:
     # Both pumps alike: no angle, and the force that holds the length.
     assert abs(begun.phi_rad) < 0.01 and begun.length_m > PLANT.rest_length_m + 0.01
     assert begun.force1_N == pytest.approx(begun.force2_N, abs=0.1) and begun.force1_N > 0.5
-    assert begun.lag1_N == begun.force1_N and begun.creep1_N == 0.0
+    assert begun.gap1_N == 0.0 and begun.creep1_N == 0.0
+
+
+@pytest.mark.parametrize("tick", [75, 105])
+def test_a_log_that_begins_in_motion_is_fitted_to_its_minimum(tick: int) -> None:
+    """Below its lag a force says nothing, and beside that its derivative is none."""
+    one = track(
+        "prbs", {"stiffness_scale": 1.3, "strength1": 1.2, "strength2": 1.1, "lag_s": 0.3}, duration_s=6.0
+    )
+    from_s = tick * one.tick_s
+    moving, late = _started(one, from_s), one.t_s >= from_s + 0.035
+    assert isinstance(moving, Start)
+    head, whitening = one.head[late], one.whitening[late]
+    cut = replace(
+        one, pwm=one.pwm[tick:], t_s=one.t_s[late] - from_s, head=head, whitening=whitening, moving=moving
+    )
+    problem = Problem(Machine(), [cut], ("stiffness_scale", "lag_s", "strength1", "strength2"), {})
+    x, cost, _, _ = solve(problem, first_guess(problem, values_of(Machine())), 40)
+    # White residuals leave .45 of their number.
+    assert cost < 0.46 * 2 * len(cut.t_s)
+    assert x[0] == pytest.approx(1.3, abs=0.01)
 
 
 def test_the_true_model_leaves_the_noise_and_another_one_more() -> None:

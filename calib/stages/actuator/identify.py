@@ -210,8 +210,9 @@ class Start:
     Attributes
     ----------
     phi_rad, length_m, dphi_radps, dlength_mps : of the head.
-    creep1_N, creep2_N : z of (3.45). force1_N, force2_N : of the pumps. lag1_N, lag2_N : of their lags, which
-        are below the forces while air leaves at its limit.
+    creep1_N, creep2_N : z of (3.45). force1_N, force2_N : of the pumps. gap1_N, gap2_N : by how much their
+        lags are below the forces, while air leaves at its limit: a lag above a force pulls it along at once,
+        so that no fit could tell how far.
     """
 
     phi_rad: float
@@ -222,14 +223,15 @@ class Start:
     creep2_N: float = 0.0
     force1_N: float = 0.0
     force2_N: float = 0.0
-    lag1_N: float = 0.0
-    lag2_N: float = 0.0
+    gap1_N: float = 0.0
+    gap2_N: float = 0.0
 
     def row(self, plant: Plant) -> FloatArray:
         """The row (10,) of `simulate.STATE`."""
         row = state_row(plant, self.phi_rad, self.length_m, (self.force1_N, self.force2_N))
         row[2:4] = bellows(self.dphi_radps, self.dlength_mps, plant.bellows_radius_m)
-        row[4:8] = self.creep1_N, self.creep2_N, self.lag1_N, self.lag2_N
+        lags = self.force1_N - self.gap1_N, self.force2_N - self.gap2_N
+        row[4:8] = self.creep1_N, self.creep2_N, *lags
         return row
 
 
@@ -357,10 +359,11 @@ DELAY_SIGMA_S = 0.03
 STEP = 1e-4
 _START_STEP = (1e-4, 1e-5, 1e-3, *(1e-4,) * 7)
 _START_SCALE = (0.01, 0.001, 0.1, 0.005, 0.02, 0.02, *(0.05,) * 4)
-_START_REACH = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
-"""Steps, scales and bounds by `COMPONENTS`."""
+_START_BELOW = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, 5.0, 5.0, 0.0, 0.0)
+_START_ABOVE = (0.3, 0.02, 30.0, 1.0, 2.0, 2.0, *(5.0,) * 4)
+"""Steps, scales and reach on both sides of a guess by `COMPONENTS`."""
 _FREE_SIGMA = (3.0, 0.1, 0.2, 0.2)
-_PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, *(0.5,) * 4)
+_PUMPED_SIGMA = (0.5, 0.02, 0.2, 0.2, 0.5, 0.5, 1.0, 1.0)
 """Priors of the same, without those of angle and length: of free swings and of logs with pumps."""
 
 
@@ -447,10 +450,12 @@ class Problem:
         for track in self.tracks:
             at, moving = len(rows), track.moving is not None
             sigma = (inf, inf, *(_PUMPED_SIGMA if track.hoses else _FREE_SIGMA))
-            of_start = zip(astuple(track.start), _START_SCALE, _START_REACH, sigma, strict=False)
+            of_start = zip(
+                astuple(track.start), _START_SCALE, _START_BELOW, _START_ABOVE, sigma, strict=False
+            )
             rows += [
-                (scale, guess - reach, guess + reach, guess, deviation if moving else inf)
-                for _, (guess, scale, reach, deviation) in zip(track.unknown, of_start, strict=False)
+                (scale, guess - below, guess + above, guess, deviation if moving else inf)
+                for _, (guess, scale, below, above, deviation) in zip(track.unknown, of_start, strict=False)
             ]
             starts.append(slice(at, len(rows)))
         count = len(self.names)
@@ -526,18 +531,17 @@ def residuals(problem: Problem, xs: FloatArray) -> FloatArray:
 def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals (rows,) and their derivatives (rows, size) at a vector of unknowns."""
     unknowns, P = problem.unknowns, len(problem.names)
-    steps = STEP * np.maximum(np.abs(x[:P]), unknowns.scale[:P])
-    up = np.minimum(x[:P] + steps, unknowns.high[:P])
-    down = np.maximum(x[:P] - steps, unknowns.low[:P])
-    start_steps = np.array(_START_STEP)
+    steps = STEP * np.maximum(np.abs(x), unknowns.scale)
+    for at in unknowns.starts:
+        steps[at] = _START_STEP[: at.stop - at.start]
+    up, down = np.minimum(x + steps, unknowns.high), np.maximum(x - steps, unknowns.low)
     if problem.rough:
-        up, down = np.where(up - x[:P] >= x[:P] - down, up, down), x[:P]
-    width = np.concatenate([up - down, start_steps if problem.rough else 2.0 * start_steps])
-    sides = (1.0,) if problem.rough else (1.0, -1.0)
+        up, down = np.where(up - x >= x - down, up, down), x
+    width, sides = up - down, (up,) if problem.rough else (up, down)
     base = problem.values(x)
     moved = [base]
-    for name, *ends in zip(problem.names, up.tolist(), down.tolist(), strict=True):
-        moved += [{**base, name: end} for end in ends[: len(sides)]]
+    for i, name in enumerate(problem.names):
+        moved += [{**base, name: float(side[i])} for side in sides]
     # Making a plant checks it, which takes as long as a short log: once for all logs of a kind.
     alike: dict[tuple[bool, float], list[tuple[Plant, Pump]]] = {}
     blocks, errors = [], []
@@ -547,28 +551,28 @@ def jacobian(problem: Problem, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         if kind not in alike:
             alike[kind] = [problem.pair(track, values) for values in moved]
         pairs, starts = alike[kind], [begin] * len(moved)
-        count = len(track.unknown)
-        for name, step in zip(track.unknown, _START_STEP, strict=False):
-            starts += [replace(begin, **{name: getattr(begin, name) + s * step}) for s in sides]
+        at = unknowns.starts[k]
+        for i, name in enumerate(track.unknown, at.start):
+            starts += [replace(begin, **{name: float(side[i])}) for side in sides]
         delay = unknowns.delays[k]
         pairs = pairs + pairs[:1] * (len(starts) - len(pairs))
         head, rate = heads_of(track, pairs, starts, float(x[delay]), problem.per_tick)
         W = track.whitening
         J = np.zeros((len(track.t_s), 2, unknowns.size))
         moved_to, moved_from = (head[1:], head[:1]) if problem.rough else (head[1::2], head[2::2])
-        slope = (moved_to - moved_from) / width[: P + count, None, None]
+        slope = (moved_to - moved_from) / np.concatenate([width[:P], width[at]])[:, None, None]
         slope = -np.einsum("mij,smj->mis", W, slope)
         J[:, :, :P] = slope[:, :, :P]
-        J[:, :, unknowns.starts[k]] = slope[:, :, P:]
+        J[:, :, at] = slope[:, :, P:]
         J[:, :, unknowns.offset] = -W
         J[:, :, delay] = whitened(track, rate[0])
         error = whitened(track, track.head - head[0] - x[unknowns.offset])
         good = np.isfinite(error).all() and np.isfinite(J).all()
         blocks.append(J.reshape(-1, unknowns.size) if good else np.zeros((2 * len(track.t_s), unknowns.size)))
         errors.append(np.where(np.isfinite(error), error, FAR).reshape(-1))
-    at = unknowns.priors
-    priors = np.zeros((len(at), unknowns.size))
-    priors[np.arange(len(at)), at] = 1.0 / unknowns.sigma[at]
+    told = unknowns.priors
+    priors = np.zeros((len(told), unknowns.size))
+    priors[np.arange(len(told)), told] = 1.0 / unknowns.sigma[told]
     return np.concatenate([*errors, _priors(problem, x)]), np.vstack([*blocks, priors])
 
 

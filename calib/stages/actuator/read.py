@@ -257,7 +257,7 @@ def held_by_pumps(start: Start, plant: Plant) -> Start:
     """The start with pumps that just hold the head."""
     q = bellows(start.phi_rad, start.length_m, plant.bellows_radius_m)
     F1, F2 = np.maximum(holding_force(plant, q), 0.0).tolist()
-    return replace(start, force1_N=F1, force2_N=F2, lag1_N=F1, lag2_N=F2)
+    return replace(start, force1_N=F1, force2_N=F2)
 
 
 def start_in_motion(
