@@ -119,6 +119,7 @@ MOST_PWM = 250
 _PULLED_RAD = (math.radians(12.0), math.radians(50.0))
 _STILL_RADPS, _LET_GO_RADPS = 0.15, 0.6
 _STILL_S, _SLIP_S, _BEFORE_S, _HAND_S = 0.8, 0.05, 0.06, 60.0
+_AT_REST, _TOLD_EVERY_S = 50, 2.0
 
 
 class Port(Protocol):
@@ -222,7 +223,7 @@ def perform(
     """
     board.port.write(serial.CLEAR)
     _wait_for(board, lambda message: isinstance(message, serial.ImuSample), "its IMU gives no samples")
-    before = _let_go(board, tell) if plan.by_hand else []
+    before = _wait_for_release(board, tell) if plan.by_hand else []
     try:
         if plan.command is not None:
             board.pumps((0, 0))
@@ -247,19 +248,8 @@ def _recorded(
             if plan.command is not None:
                 first, second = plan.command(rows.time_s)
                 board.pumps((round(top * first), round(top * second)))
-            if message is None or isinstance(message, serial.Hello | serial.Frame):
-                if isinstance(message, serial.Frame) or (
-                    isinstance(message, serial.Hello) and rows.begins_anew(message)
-                ):
-                    kept = message.kept if isinstance(message, serial.Hello) else 0
-                    why = f" ({serial.FAULTS[kept]})" if kept in serial.FAULTS else ""
-                    raise BadInputError(
-                        f"{board.name}: the board restarted after {rows.time_s:.1f} s{why}; record this again"
-                    )
-                if now - heard_s > _RESTARTS_S:
-                    raise BadInputError(
-                        f"{board.name}: the board fell silent after {rows.time_s:.1f} s; record this again"
-                    )
+            if not isinstance(message, serial.ImuSample | serial.Picture):
+                _check_goes_on(board, rows, message, now - heard_s)
                 continue
             heard_s = now
             write(rows.take(message))
@@ -280,6 +270,27 @@ def _recorded(
     return Done(rows.time_s, imu, markers, rows.lost, board.decoder.damaged - damaged, overruns)
 
 
+def _check_goes_on(
+    board: Board, rows: serial.Rows, message: serial.Hello | serial.Frame | None, silent_s: float
+) -> None:
+    """Raise `BadInputError` where the board has restarted, or has sent no sample for long."""
+    hello = message if isinstance(message, serial.Hello) else None
+    if isinstance(message, serial.Frame) or (hello is not None and rows.begins_anew(hello)):
+        why = _fault(0 if hello is None else hello.kept)
+        raise BadInputError(
+            f"{board.name}: the board restarted after {rows.time_s:.1f} s{why}; record this again"
+        )
+    if silent_s > _RESTARTS_S:
+        raise BadInputError(
+            f"{board.name}: the board fell silent after {rows.time_s:.1f} s; record this again"
+        )
+
+
+def _fault(number: int) -> str:
+    """A fault of the guard in brackets; empty for none that is known."""
+    return f" ({serial.FAULTS[number]})" if number in serial.FAULTS else ""
+
+
 def _lets_run(message: serial.Message) -> bool:
     return isinstance(message, serial.Picture) and message.guard.state == serial.GUARD_RUN
 
@@ -294,24 +305,16 @@ def _wait_for(board: Board, there: Callable[[serial.Message], bool], lacks: str)
             fault = message.guard.fault or fault
         if board.port.now_s() - began > _RUN_S:
             break
-    why = f" ({serial.FAULTS[fault]})" if fault in serial.FAULTS else ""
-    raise BadInputError(f"{board.name}: the board answers, but {lacks}{why}")
+    raise BadInputError(f"{board.name}: the board answers, but {lacks}{_fault(fault)}")
 
 
-def _let_go(board: Board, tell: Callable[[str], None]) -> list[serial.Message]:
-    """Say what to do with the head; what came in the last moment before it swings.
-
-    The angle at rest is taken first, so that it does not matter how the IMU is mounted.
-    """
+def _wait_for_release(board: Board, tell: Callable[[str], None]) -> list[serial.Message]:
+    """Say what to do with the head; what came in the last moment before it swings."""
     recent: deque[tuple[float, serial.Message]] = deque()
-    rest: list[tuple[float, float]] = []
-    zero: float | None = None
-    moved_s = told_s = calm_s = -math.inf
-    holds = False
-    began = board.port.now_s()
+    pull = _Pull(tell, board.port.now_s())
     for message in board.messages():
         now = board.port.now_s()
-        if now - began > _HAND_S:
+        if now - pull.began_s > _HAND_S:
             raise BadInputError(
                 f"{board.name}: the head was not pulled aside and let go within {_HAND_S:g} s"
             )
@@ -320,33 +323,53 @@ def _let_go(board: Board, tell: Callable[[str], None]) -> list[serial.Message]:
         recent.append((now, message))
         while recent[0][0] < now - _BEFORE_S:
             recent.popleft()
-        if not isinstance(message, serial.ImuSample):
-            continue
-        spin = abs(message.rate[2])
-        if zero is None:
-            rest.append((message.force[0], message.force[1]))
-            if len(rest) >= 50:
-                zero = math.atan2(sum(y for _, y in rest), sum(x for x, _ in rest))
-                tell("pull the head aside by 20 to 30 degrees, and hold it")
-                began = now
-            continue
-        if holds and spin > _LET_GO_RADPS:
+        if isinstance(message, serial.ImuSample) and pull.ends_with(message, now):
             return [one for _, one in recent]
-        angle = abs(math.remainder(math.atan2(message.force[1], message.force[0]) - zero, 2.0 * math.pi))
-        if spin > _STILL_RADPS or not _PULLED_RAD[0] <= angle <= _PULLED_RAD[1]:
-            if holds and now - calm_s < _SLIP_S:
-                # A head that is let go is slow for a sample as well.
-                continue
-            moved_s = now
-            if holds:
-                tell("it moved slowly: hold it")
-            holds = False
-            if now - told_s > 2.0:
-                told_s = now
-                tell(f"  {math.degrees(angle):.0f} degrees")
-            continue
-        calm_s = now
-        if not holds and now - max(moved_s, began) > _STILL_S:
-            holds = True
-            tell("let go")
     raise AssertionError("unreachable")
+
+
+class _Pull:
+    """A head that a person pulls aside, holds and lets go, and what the person is told to do.
+
+    The angle at rest is taken first, so that it does not matter how the IMU is mounted.
+    """
+
+    def __init__(self, tell: Callable[[str], None], now_s: float) -> None:
+        self.tell, self.began_s = tell, now_s
+        self._rest: list[tuple[float, float]] = []
+        self._zero_rad: float | None = None
+        self._moved_s = self._told_s = self._calm_s = -math.inf
+        self._held = False
+
+    def ends_with(self, sample: serial.ImuSample, now_s: float) -> bool:
+        """Whether the head is let go in this sample."""
+        x, y, _ = sample.force
+        if self._zero_rad is None:
+            self._rest.append((x, y))
+            if len(self._rest) >= _AT_REST:
+                self._zero_rad = math.atan2(sum(y for _, y in self._rest), sum(x for x, _ in self._rest))
+                self.tell("pull the head aside by 20 to 30 degrees, and hold it")
+                self.began_s = now_s
+            return False
+        spin = abs(sample.rate[2])
+        if self._held and spin > _LET_GO_RADPS:
+            return True
+        angle = abs(math.remainder(math.atan2(y, x) - self._zero_rad, 2.0 * math.pi))
+        if spin <= _STILL_RADPS and _PULLED_RAD[0] <= angle <= _PULLED_RAD[1]:
+            self._calm_s = now_s
+            if not self._held and now_s - max(self._moved_s, self.began_s) > _STILL_S:
+                self._held = True
+                self.tell("let go")
+        # A head that is let go is slow for a sample as well.
+        elif not self._held or now_s - self._calm_s >= _SLIP_S:
+            self._moves(angle, now_s)
+        return False
+
+    def _moves(self, angle_rad: float, now_s: float) -> None:
+        self._moved_s = now_s
+        if self._held:
+            self.tell("it moved slowly: hold it")
+        self._held = False
+        if now_s - self._told_s > _TOLD_EVERY_S:
+            self._told_s = now_s
+            self.tell(f"  {math.degrees(angle_rad):.0f} degrees")

@@ -29,7 +29,7 @@ from calib.io.experiments import (
     Board,
     Done,
     Experiment,
-    _let_go,
+    _wait_for_release,
     experiment,
     perform,
 )
@@ -229,7 +229,7 @@ def test_the_head_is_let_go_when_it_is_held_still_and_not_before(bare: Built, tm
 
 
 @pytest.mark.parametrize(("slow", "again"), [(1, 0), (20, 90)])
-def test_a_head_that_is_slow_for_a_sample_is_let_go(slow: int, again: int) -> None:
+def test_a_head_that_is_slow_for_a_sample_is_wait_for_release(slow: int, again: int) -> None:
     """One sample at the release is between still and gone; 0.2 s of them are a hand that slips."""
     now_s, words = 0.0, []
 
@@ -244,7 +244,7 @@ def test_a_head_that_is_slow_for_a_sample_is_let_go(slow: int, again: int) -> No
                 yield ImuSample(0, 0, force, (0.0, 0.0, rate))
 
     board = SimpleNamespace(name="board", port=SimpleNamespace(now_s=lambda: now_s), messages=samples)
-    last = _let_go(cast("Board", board), words.append)[-1]
+    last = _wait_for_release(cast("Board", board), words.append)[-1]
     assert isinstance(last, ImuSample) and last.rate[2] == 1.0
     assert ("it moved slowly: hold it" in words) == (again > 0)
 

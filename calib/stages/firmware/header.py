@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -214,13 +214,94 @@ def _undone(inverse: InverseLens) -> bool:
     return error is not None and error <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
 
 
-_SEEN = 0.8
+_LEAST_PICTURES = 0.8
 """Pictures per tick; where fewer come the guard's count of lost ones runs full."""
 _WIDE = 4.0
 """Times the default from which on a limit of the envelope is remarked on."""
+_DEFAULTED = ("align", "actuator", "pump")
+"""Sections for which the header has defaults."""
+_MOUNTED_RAD = 0.1
+"""Angle of an IMU at rest that the board may take for bending: 1.3 mm of the nominal bellows' lengths."""
 
 
-def _of_envelope(stated: Envelope, allowed: Mapping[str, Any], rest_m: float) -> list[Finding]:
+def _judge(rig: Rig, inverse: InverseLens | None) -> Iterator[Finding]:
+    """Findings on the sections that the constants come from, and on how the lens is undone."""
+    # With an alignment the header takes nothing from a log at rest.
+    taken = [name for name in FLASHED if name != "imu" or rig.align is None]
+    yield from _poor_sections(rig, taken)
+    if inverse is not None and not _undone(inverse):
+        error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
+        text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
+        yield Finding("poor", text, _UNREAD)
+    yield from _no_control(rig) or _defaults(rig, [*taken, "actuator", "pump"])
+    yield from _pictures_and_ticks(rig)
+    if rig.simulated:
+        text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
+        yield Finding("remark", text)
+
+
+def _poor_sections(rig: Rig, taken: Sequence[str]) -> Iterator[Finding]:
+    """Sections that are not ok, or older than what they were computed from."""
+    for name in taken:
+        section = getattr(rig, name)
+        if section is not None and not section.verdict.ok:
+            advice = _UNREAD if name in ("camera", "plane") else ""
+            word = section.verdict.word
+            yield Finding(word, f"{name.replace('_', ' ')} is {word}", advice)
+    # A lens of another camera, or one that was changed, is not taken but undone anew.
+    stale = rig.outdated([*(name for name in taken if name != "lens"), "actuator", "pump"])
+    yield from (Finding("poor", sentence) for sentence in stale)
+
+
+def _no_control(rig: Rig) -> list[Finding]:
+    """What a rig lacks to be controlled; empty for none."""
+    if rig.camera is None or rig.plane is None:
+        lacks, verb = ("camera", "intrinsics") if rig.camera is None else ("plane", "extrinsics")
+        text = f"no {lacks} yet: the sketch records, and controls nothing"
+        return [Finding("remark", text, f"run calib {verb}")]
+    if rig.controller is None:
+        return [Finding("remark", _UNTUNED, "run calib identify and calib control tune")]
+    return []
+
+
+def _defaults(rig: Rig, taken: Sequence[str]) -> Iterator[Finding]:
+    """Defaults of a rig that controls: in place of sections that are gone, and of the IMU's mount."""
+    for gone in _DEFAULTED:
+        with_it = [name for name in taken if rig.inputs.get(name, {}).get(gone)]
+        if getattr(rig, gone) is None and with_it:
+            text = f"{gone}, with which {with_it[0]} was computed, is not there: the header has defaults"
+            yield Finding("poor", text, f"run calib {VERBS[gone]} again")
+    if rig.align is None and rig.imu is None:
+        text = "neither imu nor align: the board's angle comes from an IMU that nobody has measured"
+        yield Finding("poor", text, "run calib imu static and calib align")
+    elif rig.align is None and rig.imu is not None:
+        signs = (rig.geometry and rig.geometry.imu_sign) or (1, 1, 1)
+        ax, ay = ((rig.imu.accel_mean_mps2[i] or 0.0) * signs[i] for i in range(2))
+        rest_rad = math.atan2(ay, ax)
+        if abs(rest_rad) > _MOUNTED_RAD:
+            text = f"no align: the IMU reads {rest_rad:.2f} rad at rest, which the board takes for bending"
+            yield Finding("poor", text, "run calib align")
+
+
+def _pictures_and_ticks(rig: Rig) -> Iterator[Finding]:
+    """Pictures that come more seldom than ticks, or earlier than the IMU's samples."""
+    logs = [] if rig.align is None else rig.align.logs
+    rates_hz = [one.camera_rate_hz for one in logs if one.camera_rate_hz]
+    pictures_hz = median(rates_hz) if rates_hz else rig.tick_hz
+    if pictures_hz < _LEAST_PICTURES * rig.tick_hz:
+        yield Finding(
+            "poor",
+            f"the camera gives {pictures_hz:.3g} pictures a second and the board ticks at {rig.tick_hz:g} "
+            "Hz: the guard takes a tick without a picture for a lost marker, and stops the pumps",
+            f"let the board tick at the camera's rate: calib lowpass --rate {pictures_hz:.0f}Hz",
+        )
+    if rig.align is not None and rig.align.time_offset_s < 0.0:
+        early_ms = -1e3 * rig.align.time_offset_s
+        text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"
+        yield Finding("remark", text)
+
+
+def _judge_envelope(stated: Envelope, allowed: Mapping[str, Any], rest_m: float) -> list[Finding]:
     """Findings on an envelope that a person states: it stops a rig that rests, or hardly any."""
     least, greatest = allowed["least_length_m"], allowed["greatest_length_m"]
     if not least < rest_m < greatest:
@@ -232,80 +313,6 @@ def _of_envelope(stated: Envelope, allowed: Mapping[str, Any], rest_m: float) ->
     wide += ["greatest_length_m"] if greatest > _WIDE * rest_m else []
     text = f"the envelope allows much more than by default, so that the guard acts late: {', '.join(wide)}"
     return [Finding("remark", text)] if wide else []
-
-
-_DEFAULTED = ("align", "actuator", "pump")
-"""Sections for which the header has defaults."""
-_MOUNTED_RAD = 0.1
-"""Angle of an IMU at rest that the board may take for bending: 1.3 mm of the nominal bellows' lengths."""
-
-
-def _of_defaults(whole: Rig, taken: list[str]) -> list[Finding]:
-    """Findings on defaults of a rig that controls: in place of sections that are gone, and of the mount."""
-    found = []
-    for gone in _DEFAULTED:
-        with_it = [name for name in taken if whole.inputs.get(name, {}).get(gone)]
-        if getattr(whole, gone) is None and with_it:
-            text = f"{gone}, with which {with_it[0]} was computed, is not there: the header has defaults"
-            found.append(Finding("poor", text, f"run calib {VERBS[gone]} again"))
-    if whole.align is None and whole.imu is None:
-        text = "neither imu nor align: the board's angle comes from an IMU that nobody has measured"
-        found.append(Finding("poor", text, "run calib imu static and calib align"))
-    elif whole.align is None and whole.imu is not None:
-        signs = (whole.geometry and whole.geometry.imu_sign) or (1, 1, 1)
-        ax, ay = ((whole.imu.accel_mean_mps2[i] or 0.0) * signs[i] for i in range(2))
-        rest_rad = math.atan2(ay, ax)
-        if abs(rest_rad) > _MOUNTED_RAD:
-            text = f"no align: the IMU reads {rest_rad:.2f} rad at rest, which the board takes for bending"
-            found.append(Finding("poor", text, "run calib align"))
-    return found
-
-
-def _judge(whole: Rig, inverse: InverseLens | None) -> list[Finding]:
-    """Findings on the sections that the constants come from, and on how the lens is undone."""
-    findings = []
-    # With an alignment the header takes nothing from a log at rest.
-    taken = [name for name in FLASHED if name != "imu" or whole.align is None]
-    for name in taken:
-        section = getattr(whole, name)
-        if section is not None and not section.verdict.ok:
-            advice = _UNREAD if name in ("camera", "plane") else ""
-            word = section.verdict.word
-            findings.append(Finding(word, f"{name.replace('_', ' ')} is {word}", advice))
-    # A lens of another camera, or one that was changed, is not taken but undone anew.
-    stale = whole.outdated([*(name for name in taken if name != "lens"), "actuator", "pump"])
-    findings += [Finding("poor", sentence) for sentence in stale]
-    if inverse is not None and not _undone(inverse):
-        error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
-        text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
-        findings.append(Finding("poor", text, _UNREAD))
-    if whole.camera is None or whole.plane is None:
-        lacks, verb = ("camera", "intrinsics") if whole.camera is None else ("plane", "extrinsics")
-        text = f"no {lacks} yet: the sketch records, and controls nothing"
-        findings.append(Finding("remark", text, f"run calib {verb}"))
-    elif whole.controller is None:
-        findings.append(Finding("remark", _UNTUNED, "run calib identify and calib control tune"))
-    else:
-        findings += _of_defaults(whole, [*taken, "actuator", "pump"])
-    logs = [] if whole.align is None else whole.align.logs
-    rates_hz = [one.camera_rate_hz for one in logs if one.camera_rate_hz]
-    seen_hz = median(rates_hz) if rates_hz else whole.tick_hz
-    if seen_hz < _SEEN * whole.tick_hz:
-        text = f"the camera gives {seen_hz:.3g} pictures a second and the board ticks at {whole.tick_hz:g} Hz"
-        text += ": the guard takes a tick without a picture for a lost marker, and stops the pumps"
-        findings.append(
-            Finding(
-                "poor", text, f"let the board tick at the camera's rate: calib lowpass --rate {seen_hz:.0f}Hz"
-            )
-        )
-    if whole.align is not None and whole.align.time_offset_s < 0.0:
-        early_ms = -1e3 * whole.align.time_offset_s
-        text = f"pictures are {early_ms:.1f} ms earlier than the IMU's samples, and count as of their time"
-        findings.append(Finding("remark", text))
-    if whole.simulated:
-        text = "the rig is a simulated one: for a board its constants compile only with CALIB_I_KNOW"
-        findings.append(Finding("remark", text))
-    return findings
 
 
 def header_of(rig: Rig, source: str) -> Header:
@@ -335,9 +342,9 @@ def header_of(rig: Rig, source: str) -> Header:
         # Sections that name others as inputs; only files are inputs of the header.
         if name not in KINDS and (section != "plane" or plane is not None)
     }
-    findings = _judge(rig, inverse)
+    findings = [*_judge(rig, inverse)]
     if rig.envelope is not None:
-        findings += _of_envelope(rig.envelope, context["envelope"], context["rest_length_m"])
+        findings += _judge_envelope(rig.envelope, context["envelope"], context["rest_length_m"])
     verdict = Verdict.of(findings)
     text = rendered(
         "calib_constants.h.j2",
