@@ -32,8 +32,8 @@ from calib.core.words import short
 from calib.core.workers import Processes, Task
 from calib.runner import outcomes
 from calib.runner.cache import program
+from calib.stages.control.tracking import Tracking
 from calib.stages.control.trial import control_model, run_controller
-from calib.stages.control.tuning import Tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.scenarios import SCENARIOS
 

@@ -29,7 +29,7 @@ from calib.stages.control.laws import (
     saturate,
 )
 from calib.stages.control.references import Ellipse, PolynomialElongation
-from calib.stages.control.tuning import settling_s
+from calib.stages.control.tracking import settling_s
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
 from calib.twin.simulate import Law, Run, Seen, log_of, ticks_in

@@ -10,8 +10,8 @@ import pytest
 from control_models import NOMINAL
 
 from calib.stages.control.references import BUILT_IN, Reference, built_in, from_lengths
+from calib.stages.control.tracking import tracking
 from calib.stages.control.trial import CONTROLLERS, Outcome, control_model, run_controller
-from calib.stages.control.tuning import tracking
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import EllipseTrack, Elongation, Orientation
 

@@ -16,27 +16,27 @@ from scipy import signal
 from calib.core.errors import BadInputError
 from calib.stages.actuator.simulate import RigState
 from calib.stages.control.laws import Channel, Model, Pid, bent_rest, feed_forward_pwm, holding_force
-from calib.stages.control.section import ControllerCriterion
-from calib.stages.control.tuning import (
+from calib.stages.control.loops import (
     System,
-    Tuned,
-    approach_s,
-    both_channels,
     break_at,
     closed_loop,
     delay,
-    follow,
-    holds,
-    largest_angle,
     loop_margins,
-    operating_angles,
-    orientation_loop,
     pid_system,
-    position_loop,
     response,
     rig_system,
     series,
     spectral_radius,
+)
+from calib.stages.control.reach import approach_s, follow, largest_angle
+from calib.stages.control.section import ControllerCriterion
+from calib.stages.control.tuning import (
+    Tuned,
+    both_channels,
+    holds,
+    operating_angles,
+    orientation_loop,
+    position_loop,
     tune_orientation,
     tune_position,
 )

@@ -18,6 +18,7 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.actuator.kinematics import angle, forward
 from calib.stages.control.laws import Model, feed_forward_pwm
+from calib.stages.control.reach import follow, largest_angle, longest_m, reachable, slowed
 from calib.stages.control.read import read_reference, recorded_reference
 from calib.stages.control.references import (
     BUILT_IN,
@@ -27,7 +28,6 @@ from calib.stages.control.references import (
     from_angles,
     resampled,
 )
-from calib.stages.control.tuning import follow, largest_angle, longest_m, reachable, slowed
 from calib.stages.estimator import replay
 
 H = NOMINAL.tick_s

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.core import plot
 from calib.stages.actuator.kinematics import angle, bellows, forward, length
-from calib.stages.control import tuning
+from calib.stages.control import loops, reach, tuning
 from calib.stages.control.laws import Model, holding_force, largest_force_N
 from calib.stages.control.references import Reference
 from calib.stages.control.section import Controller
@@ -103,10 +103,10 @@ def tune_plots(section: Controller) -> dict[str, plot.Figure]:
 
 
 def _loop(
-    model: Model, name: str, loop_of: Callable[..., tuning.System], tuned: tuning.Tuned, sensitivity: float
+    model: Model, name: str, loop_of: Callable[..., loops.System], tuned: tuning.Tuned, sensitivity: float
 ) -> tuple[plot.Plot, plot.Plot, plot.Plot]:
     """Gain, phase and Nyquist's curve of a loop at each rest."""
-    w = tuning.frequencies(model.tick_s, 1200)
+    w = loops.frequencies(model.tick_s, 1200)
     f = w / (2.0 * np.pi)
     gain: list[plot.Mark] = [plot.Rule("y", 0.0, "ink")]
     phase: list[plot.Mark] = [plot.Rule("y", -180.0, "ink")]
@@ -116,7 +116,7 @@ def _loop(
         minus_one,
     ]
     for hue, point in zip(plot.spaced(len(tuned.points)).tolist(), tuned.points, strict=True):
-        L = tuning.break_at(tuning.response(loop_of(model, tuned.pid, point.q_m), w), 0)
+        L = loops.break_at(loops.response(loop_of(model, tuned.pid, point.q_m), w), 0)
         label = " ".join(f"{1e3 * q:.1f}" for q in point.q_m)
         gain.append(plot.Curve(f, 20.0 * np.log10(np.maximum(np.abs(L), 1e-12)), label, colour=hue))
         phase.append(plot.Curve(f, np.degrees(np.unwrap(np.angle(L))), colour=hue))
@@ -171,7 +171,7 @@ def check_plots(checked: Checked) -> dict[str, plot.Figure]:
 def _reachable(model: Model) -> plot.Mark:
     """Where the pumps can hold the head, over its angle and the length in mm."""
     plant, rest = model.plant, model.plant.rest_length_m
-    phi_most, l_most = 1.1 * tuning.largest_angle(model), tuning.longest_m(model)
+    phi_most, l_most = 1.1 * reach.largest_angle(model), reach.longest_m(model)
     phi = np.linspace(-phi_most, phi_most, 161)
     l = np.linspace(rest - 0.1 * (l_most - rest), l_most + 0.05 * (l_most - rest), 121)  # noqa: E741  the source's symbol
     F = holding_force(plant, bellows(phi, l[:, None], plant.bellows_radius_m))

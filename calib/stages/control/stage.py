@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from calib.core.rig import Rig
     from calib.core.stage import Progress
     from calib.stages.control.laws import Model
+    from calib.stages.control.reach import Following
     from calib.stages.control.references import Reference
     from calib.stages.control.section import (
         AntiWindup,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
         StaticMap,
     )
     from calib.stages.control.trial import Outcome
-    from calib.stages.control.tuning import Following, Point, Tuned
+    from calib.stages.control.tuning import Point, Tuned
     from calib.twin.rig import SimulatedRig
 
 _REFERENCE = (
@@ -161,8 +162,8 @@ def _solve_run(
     options: RunOptions,
     progress: Progress,
 ) -> Runs:
+    from calib.stages.control.reach import follow
     from calib.stages.control.trial import run_controller
-    from calib.stages.control.tuning import follow
 
     outcomes = []
     with progress("simulating") as tell:
@@ -305,8 +306,8 @@ def _read_check(files: Files, rig: Rig, options: CheckOptions) -> tuple[Model, R
 
 
 def _solve_check(model: Model, wanted: Reference) -> Checked:
+    from calib.stages.control.reach import follow, slowed
     from calib.stages.control.references import from_lengths
-    from calib.stages.control.tuning import follow, slowed
 
     path_m = wanted.path_m(model.plant.rest_length_m)
     found = follow(model, path_m)
@@ -322,7 +323,7 @@ def _solve_check(model: Model, wanted: Reference) -> Checked:
 
 def _check_document(checked: Checked) -> dict[str, Any]:
     from calib.stages.control.laws import largest_force_N
-    from calib.stages.control.tuning import largest_angle, longest_m
+    from calib.stages.control.reach import largest_angle, longest_m
 
     reach = {
         "greatest_angle_rad": largest_angle(checked.model),
@@ -339,7 +340,7 @@ def _check_document(checked: Checked) -> dict[str, Any]:
 
 
 def _check_words(checked: Checked) -> list[Block]:
-    from calib.stages.control.tuning import largest_angle, longest_m, unlike
+    from calib.stages.control.reach import largest_angle, longest_m, unlike
 
     model = checked.model
     bent = f"{largest_angle(model):.3f} rad"

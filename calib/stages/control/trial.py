@@ -41,9 +41,10 @@ from calib.stages.control.laws import (
     feed_forward_pwm,
     wanted_motion,
 )
+from calib.stages.control.reach import largest_angle
 from calib.stages.control.references import Reference, built_in, from_angles
 from calib.stages.control.section import Controller
-from calib.stages.control.tuning import Tracking, largest_angle, tracking
+from calib.stages.control.tracking import Tracking, tracking
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.scenarios import angle_law, at_rest, length_law
 from calib.twin.simulate import Law, Run, Seen, simulate
