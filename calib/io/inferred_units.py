@@ -46,7 +46,7 @@ _QUIET_RADPS = 0.005
 """Spread at rest of those on cheap boards; one that is in deg/s is quieter than that in none."""
 _REST_RAD = 0.02
 _FARTHER = 12.0
-_LEAST_TURN_RAD, _LEAST_NOISE_RAD = 0.05, 1e-5
+_LEAST_TURN_RAD = 0.05
 _AGREES = 0.3
 _BLOCK_S, _BLOCK_3D_S = 1.0, 0.25
 _MOMENT_S, _LATEST_S = 0.2, 0.2
@@ -310,7 +310,7 @@ def _with_gyro_unit(first: _FirstReadings) -> _FirstReadings:
     if unit:
         if not wrong[unit]:
             return first
-        other = next((u for u in likely if u != unit), "deg/s" if unit == "rad/s" else "rad/s")
+        other = "rad/s" if unit == "deg/s" else "deg/s"
         raise first.refused(
             f"the gyroscope {wrong[unit]}, which none does in {unit}; if it is in {other}, "
             f"{first.advice('gyro', 'gyro', other)}"
@@ -436,15 +436,14 @@ def _implausible_turns(turns: Turning, scale: float, spread: FloatArray) -> str:
     others = [share for factor, share in turns.misfit.items() if abs(factor) != scale]
     if turns.turned_rad > _LEAST_TURN_RAD and mine > _AGREES and min(others, default=1.0) < _AGREES:
         return "does not turn with the accelerometer's angle"
-    # An accelerometer that is stuck says nothing about the gyroscope.
-    felt = turns.by_force_rad > _LEAST_NOISE_RAD
     # At rest a gyroscope that is as quiet as one in this unit turns by its bias.
     biased = turns.spread_rad < _REST_RAD and float(spread.max()) < _QUIET_RADPS
     least_rad = max(_LEAST_TURN_RAD, _FARTHER * turns.by_force_rad)
-    if not felt or not turns.flat or biased or not scale * turns.by_gyro_rad > least_rad:
+    if not turns.flat or biased or not scale * turns.by_gyro_rad > least_rad:
         return ""
     times = scale * turns.by_gyro_rad / max(turns.by_force_rad, 1e-6)
-    # A pendulum's force hardly turns, in whatever unit: the sensor at its end feels the rod's alone.
+    # A pendulum's force hardly turns, in whatever unit, as the sensor at its end feels the rod's alone; nor
+    # does that of an accelerometer that is stuck.
     as_other = [times * UNITS["gyro"][unit] / scale for unit in ("rad/s", "deg/s")]
     return f"turns {times:.3g} times as far as the accelerometer's angle" if min(as_other) <= _FARTHER else ""
 

@@ -35,6 +35,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -250,69 +251,114 @@ def _stretches(starts: IntArray, n: int) -> Iterator[tuple[int, int]]:
     return pairwise([*starts.tolist(), n])
 
 
+class _Counted(NamedTuple):
+    """By which stamps the samples of a stretch are counted.
+
+    Attributes
+    ----------
+    t : (n,) stamps, those that share a step of a coarse clock spread over it.
+    anchors : (m,) samples that are counted by, the last of each burst where samples come in bursts.
+    periods : to try [s].
+    size : samples, on average, over which an anchor's stamp may be off.
+    window : anchors at a time.
+    """
+
+    t: FloatArray
+    anchors: IntArray
+    periods: list[float]
+    size: float
+    window: int
+
+    @property
+    def bursts(self) -> bool:
+        return len(self.anchors) < len(self.t)
+
+
+def _counted_by(t: FloatArray, steps: FloatArray) -> _Counted:
+    everyone, coarse = np.arange(len(t)), _coarse(t)
+    if coarse is not None:
+        step, period = coarse
+        return _Counted(_spread(t, step), everyone, [period], 2.0 + 2.0 * step / period, 2 * _LONG_LAG + 1)
+    anchors = _anchors(t)
+    # One burst may hold a sample more than the next: over few of them that counts, over many what is missing.
+    lags = [lag for lag in (_LAG, _LONG_LAG) if lag < len(anchors) < len(t)]
+    periods = [_burst_period(t, anchors, lag) for lag in lags] or [_rough_period(t, steps)]
+    return _Counted(t, anchors, periods, len(t) / len(anchors), _WINDOW)
+
+
 def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | None:
     """Times, places, period and longest burst of a stretch; None for a sensor that is not steady."""
     steps = np.diff(t)
     steps = steps[steps > 1e-6]
     if len(t) < _LEAST_SAMPLES or len(steps) < _LEAST_SAMPLES // 2:
         return None
-    i, period = np.arange(len(t)), _rough_period(t, steps)
-    coarse = _coarse(t)
-    anchors = i if coarse is not None else _anchors(t)
-    size = len(t) / len(anchors)
-    if coarse is not None:
-        step, period = coarse
-        t, size = _spread(t, step), 2.0 + 2.0 * step / period
-    window = _WINDOW if coarse is None else 2 * _LONG_LAG + 1
-    bursts = len(anchors) < len(t)
-    # One burst may hold a sample more than the next: over few of them that counts, over many what is missing.
-    lags = [lag for lag in (_LAG, _LONG_LAG) if bursts and lag < len(anchors)]
-    periods = [_burst_period(t, anchors, lag) for lag in lags] or [period]
-    later, far = (_LATER, 0.5 + _LATER) if bursts else (0.0, 0.5 * size)
+    by = _counted_by(t, steps)
+    t, anchors, count = by.t, by.anchors, np.diff(by.anchors, prepend=-1)
+    lined_up = _lined_up(by)
+    if lined_up is None:
+        return None
+    k, origin, period, wander = _gaps_settled(by, *lined_up)
+    # Samples of a burst come before its last; what is missing is missing before the burst.
+    places = np.arange(len(t)) + np.repeat(k - anchors, count).astype(np.int64)
+    times = origin + period * places + np.interp(places, k, wander)
+    if by.bursts:
+        # The least late ones tell when their last samples were taken, and none was before the reading before.
+        times += np.quantile(t[anchors] - (origin + period * k) - wander, _AT_ONCE)
+        before = np.concatenate([[-math.inf], t[anchors[:-1]]])
+        times = np.maximum(times, np.repeat(before, count))
+    times = np.maximum.accumulate(times)
+    off = np.abs(times[anchors] - t[anchors]) / (by.size * period)
+    return None if _is_wrong(off, len(t)) else (times, places - places[0], period, int(count.max()))
+
+
+def _lined_up(by: _Counted) -> tuple[FloatArray, float, float] | None:
+    """Numbers k (m,) of the anchors on a line, its origin and period; None where they are on none."""
+    later = _LATER if by.bursts else 0.0
     lines: list[tuple[tuple[float, float, float], FloatArray]] = []
     # A gap at the end of the first chunk is counted in the wrong place and bends its line.
-    for one, held in product(periods, (False, True)):
-        if bursts or not lines:
-            k = _counted(t[anchors], i[anchors], one, _UNEVEN * size, window, later, held)
-            lines += [] if k is None else [(_line(k, t[anchors]), k)]
+    for period, held in product(by.periods, (False, True)):
+        if by.bursts or not lines:
+            t = by.t[by.anchors]
+            k = _counted(t, by.anchors, period, _UNEVEN * by.size, by.window, later, held)
+            lines += [] if k is None else [(_line(k, t), k)]
     if not lines:
         return None
     (origin, period, _), k = min(lines, key=lambda one: one[0][2])
-    if not period > 0.0:
-        return None
+    return (k, origin, period) if period > 0.0 else None
+
+
+def _gaps_settled(
+    by: _Counted, k: FloatArray, origin: float, period: float
+) -> tuple[FloatArray, float, float, FloatArray]:
+    """Numbers k (m,) of the anchors with gaps in their places, the line's origin and period, wander (m,)."""
+    t, anchors = by.t, by.anchors
+    far = 0.5 + _LATER if by.bursts else 0.5 * by.size
     for look in range(_LOOKS):
         even = origin + period * k
         wander = _wander(even, t[anchors] - even)
         off = (t[anchors] - even - wander) / period
-        if bursts:
+        if by.bursts:
             off -= np.quantile(off, _AT_ONCE) + 0.5
         off = np.where(np.abs(off) > far, np.rint(off), 0.0)
         moved = _with_gaps_in_place(k - anchors, off) + anchors
-        if size == 1.0:
+        if by.size == 1.0:
             moved = _without_steps(moved, (t - origin) / period - moved)
         if look == _LOOKS - 1 or np.array_equal(moved, k):
             break
         # Gaps in their wrong places bend the line, so that the next look sees more of them.
         k = moved
         origin, period, _ = _line(k, t[anchors])
-    # Samples of a burst come before its last; what is missing is missing before the burst.
-    places = i + np.repeat(k - anchors, np.diff(anchors, prepend=-1)).astype(np.int64)
-    times = origin + period * places + np.interp(places, k, wander)
-    if bursts:
-        # The least late ones tell when their last samples were taken, and none was before the reading before.
-        times += np.quantile(t[anchors] - even - wander, _AT_ONCE)
-        before = np.concatenate([[-math.inf], t[anchors[:-1]]])
-        times = np.maximum(times, np.repeat(before, np.diff(anchors, prepend=-1)))
-    times = np.maximum.accumulate(times)
-    off = np.abs(times[anchors] - t[anchors]) / (size * period)
+    return k, origin, period, wander
+
+
+def _is_wrong(off: FloatArray, samples: int) -> bool:
+    """Whether stamps that are off their times by `off` (m,) periods tell that the line is wrong."""
     wrong = off > 0.5
     # A late stamp stands alone; where neighbours are off as well, or the samples are few, the line is wrong.
-    if _running_median(wrong.astype(np.float64)).any() or (len(t) < _RECENT and wrong.mean() > _LATE):
-        return None
+    if _running_median(wrong.astype(np.float64)).any() or (samples < _RECENT and wrong.mean() > _LATE):
+        return True
     # Of few stamps that are their own times none tells a late one from a wrong line.
-    if len(t) < 2 * _FIRST and off.max() > (_UNEVEN if np.median(off) > 1e-6 else 1e-3):
-        return None
-    return times, places - places[0], period, int(np.diff(anchors, prepend=-1).max())
+    return bool(samples < 2 * _FIRST and off.max() > (_UNEVEN if np.median(off) > 1e-6 else 1e-3))
 
 
 def _rough_period(t: FloatArray, steps: FloatArray) -> float:
