@@ -42,14 +42,11 @@ from calib.stages.lowpass.filters import (
     filter_signal,
     frequency_response,
     group_delay_s,
-    jitter_after,
     noise_gain,
-    on_ticks,
     prototype,
     rest_error_binary32,
-    spectrum,
-    suggest,
 )
+from calib.stages.lowpass.jitter import jitter_after, on_ticks, spectrum, suggest
 from calib.stages.lowpass.stage import positions_from_log, solve
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario

@@ -48,7 +48,8 @@ from calib.stages.imu.intrinsics import solve_intrinsics
 from calib.stages.imu.plots import intrinsics_plots, static_plots
 from calib.stages.imu.sampling import Readings
 from calib.stages.imu.static import solve_static
-from calib.stages.lowpass.filters import Design, Positions, design_lowpass
+from calib.stages.lowpass.filters import Design, design_lowpass
+from calib.stages.lowpass.jitter import Positions
 from calib.stages.lowpass.plots import plots as lowpass_plots
 from calib.stages.lowpass.stage import positions_from_log
 from calib.stages.lowpass.stage import solve as solve_lowpass

@@ -25,24 +25,7 @@ import numpy as np
 
 from calib.core.arrays import ComplexArray, FloatArray
 from calib.core.errors import BadInputError
-from calib.stages.control import laws
-from calib.stages.control.loops import (
-    Margins,
-    System,
-    firmware_sensing,
-    frequencies,
-    gain,
-    loci,
-    loop_margins,
-    margins_of_response,
-    pid_system,
-    response,
-    rig_system,
-    scalar_loops,
-    series,
-    side_by_side,
-    spectral_radius,
-)
+from calib.stages.control import laws, loops
 from calib.stages.control.reach import largest_angle, longest_m, reachable, unlike
 from calib.stages.control.section import ControllerCriterion
 
@@ -60,7 +43,7 @@ class Point:
     """Margins at an operating point, the least of its channels and of all together."""
 
     q_m: tuple[float, float]
-    margins: Margins
+    margins: loops.Margins
 
 
 @dataclass(frozen=True)
@@ -94,32 +77,34 @@ def operating_lengths(model: laws.Model) -> tuple[tuple[float, float], ...]:
     return tuple(q for q in found if bool(reachable(model, np.array(q))))
 
 
-def orientation_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> System:
+def orientation_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> loops.System:
     """Loop of (4.1) about a rest: error of the angle, both controllers, rig, angle."""
-    return series(pid_system(pid), _angle_rig(model, q_m))
+    return loops.series(loops.pid_system(pid), _angle_rig(model, q_m))
 
 
-def _angle_rig(model: laws.Model, q_m: tuple[float, float]) -> System:
+def _angle_rig(model: laws.Model, q_m: tuple[float, float]) -> loops.System:
     half, h = 0.5 / model.plant.bellows_radius_m, model.tick_s
-    rig = rig_system(model, np.array(q_m))
-    return series(gain(np.array([[1.0], [-1.0]]), h), series(rig, gain(np.array([[half, -half]]), h)))
+    rig = loops.rig_system(model, np.array(q_m))
+    return loops.series(
+        loops.gain(np.array([[1.0], [-1.0]]), h), loops.series(rig, loops.gain(np.array([[half, -half]]), h))
+    )
 
 
-def position_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> System:
+def position_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> loops.System:
     """Loop of (4.5) about a rest: errors of the lengths, both controllers, rig, lengths as seen."""
-    return series(both_channels(pid), _position_rig(model, q_m))
+    return loops.series(both_channels(pid), _position_rig(model, q_m))
 
 
-def both_channels(pid: laws.Pid) -> System:
+def both_channels(pid: laws.Pid) -> loops.System:
     """A controller for each bellows."""
-    return side_by_side(pid_system(pid), pid_system(pid))
+    return loops.side_by_side(loops.pid_system(pid), loops.pid_system(pid))
 
 
-def _position_rig(model: laws.Model, q_m: tuple[float, float]) -> System:
-    return series(rig_system(model, np.array(q_m)), firmware_sensing(model))
+def _position_rig(model: laws.Model, q_m: tuple[float, float]) -> loops.System:
+    return loops.series(loops.rig_system(model, np.array(q_m)), loops.firmware_sensing(model))
 
 
-def holds(criterion: ControllerCriterion, margins: Margins) -> bool:
+def holds(criterion: ControllerCriterion, margins: loops.Margins) -> bool:
     """Whether margins satisfy the criterion; stability is part of it."""
     return (
         margins.stable
@@ -130,8 +115,8 @@ def holds(criterion: ControllerCriterion, margins: Margins) -> bool:
     )
 
 
-def _worst(margins: Sequence[Margins]) -> Margins:
-    return Margins(
+def _worst(margins: Sequence[loops.Margins]) -> loops.Margins:
+    return loops.Margins(
         all(m.stable for m in margins),
         min(m.gain for m in margins),
         max(m.gain_down for m in margins),
@@ -149,17 +134,17 @@ def _largest_factor(
     omega: FloatArray,
     most: float,
 ) -> float:
-    """Largest factor on a controller's response (k,) that keeps the margins at rigs; 0 if none.
+    """Largest factor on a controller's loops.response (k,) that keeps the margins at rigs; 0 if none.
 
-    `rigs` are responses (k, n, n), each with its loci (k, n).
+    `rigs` are responses (k, n, n), each with its loops.loci (k, n).
     """
 
     def good(factor: float) -> bool:
         C = factor * shape
         return all(
-            holds(criterion, margins_of_response(omega, one, True))
+            holds(criterion, loops.margins_of_response(omega, one, True))
             for rig, together in rigs
-            for one in scalar_loops(C[:, None, None] * rig, C[:, None] * together)
+            for one in loops.scalar_loops(C[:, None, None] * rig, C[:, None] * together)
         )
 
     low, high = _LEAST * most, most
@@ -183,36 +168,38 @@ def _search(
     model: laws.Model,
     criterion: ControllerCriterion,
     at: Sequence[tuple[float, float]],
-    rigs: Sequence[System],
-    controllers: Callable[[laws.Pid], System],
+    rigs: Sequence[loops.System],
+    controllers: Callable[[laws.Pid], loops.System],
     integrals_s: Sequence[float],
     most: float,
     merit: Callable[[laws.Pid], float],
 ) -> Tuned:
-    omega = frequencies(model.tick_s, 400)
-    seen = [(L, loci(L)) for L in (response(rig, omega) for rig in rigs)]
+    omega = loops.frequencies(model.tick_s, 400)
+    seen = [(L, loops.loci(L)) for L in (loops.response(rig, omega) for rig in rigs)]
     best: list[laws.Pid] = []
     for Ti in integrals_s:
         for Td in _DERIVATIVE_S.tolist():
             unit = laws.Pid(1.0, 0.0 if math.isinf(Ti) else 1.0 / Ti, Td, tick_s=model.tick_s)
-            Kp = _largest_factor(criterion, response(pid_system(unit), omega)[:, 0, 0], seen, omega, most)
+            Kp = _largest_factor(
+                criterion, loops.response(loops.pid_system(unit), omega)[:, 0, 0], seen, omega, most
+            )
             if Kp > 0.0:
                 Kp = _two_digits(Kp)
                 gains = (_two_digits(Kp * unit.Ki), _two_digits(Kp * Td))
                 best.append(laws.Pid(Kp, *gains, tick_s=model.tick_s))
     for pid in sorted(best, key=merit, reverse=True):
-        worst = [_worst(loop_margins(series(controllers(pid), rig))) for rig in rigs]
+        worst = [_worst(loops.loop_margins(loops.series(controllers(pid), rig))) for rig in rigs]
         if all(holds(_slack(criterion), one) for one in worst):
             return Tuned(pid, tuple(map(Point, at, worst)))
     raise BadInputError(_no_gains(criterion, at, rigs))
 
 
 def _no_gains(
-    criterion: ControllerCriterion, at: Sequence[tuple[float, float]], rigs: Sequence[System]
+    criterion: ControllerCriterion, at: Sequence[tuple[float, float]], rigs: Sequence[loops.System]
 ) -> str:
     """Why not even weak gains keep margins."""
     for q_m, rig in zip(at, rigs, strict=True):
-        if (radius := spectral_radius(rig)) >= 1.0:
+        if (radius := loops.spectral_radius(rig)) >= 1.0:
             q1, q2 = (1e3 * q for q in q_m)
             grows_s = rig.tick_s / max(math.log(radius), 1e-9)
             return (
@@ -243,7 +230,9 @@ def tune_orientation(model: laws.Model, criterion: ControllerCriterion) -> Tuned
     """
     at = operating_angles(model)
     rigs = [_angle_rig(model, q) for q in at]
-    return _search(model, criterion, at, rigs, pid_system, _INTEGRAL_S.tolist(), 2e4, lambda pid: pid.Ki)
+    return _search(
+        model, criterion, at, rigs, loops.pid_system, _INTEGRAL_S.tolist(), 2e4, lambda pid: pid.Ki
+    )
 
 
 def tune_position(model: laws.Model, criterion: ControllerCriterion) -> Tuned:

@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.core import plot
 from calib.core.arrays import FloatArray
-from calib.stages.lowpass import filters
+from calib.stages.lowpass import filters, jitter
 from calib.stages.lowpass.section import LowPass
 
 _WINDOW_S = 12.0
@@ -73,7 +73,7 @@ def _poles(z: FloatArray) -> plot.Plot:
 
 
 def _on_log(
-    filter_: filters.Filter, section: LowPass, positions: filters.Positions, design: str
+    filter_: filters.Filter, section: LowPass, positions: jitter.Positions, design: str
 ) -> plot.Figure:
     """Each coordinate before and after the filter, and its spectrum."""
     log = section.log
@@ -113,7 +113,7 @@ def _window(t_s: FloatArray, values: FloatArray) -> slice:
     return slice(best, best + count)
 
 
-def _spectrum(of: filters.Spectrum, filter_: filters.Filter, scale: float, name: str, unit: str) -> plot.Plot:
+def _spectrum(of: jitter.Spectrum, filter_: filters.Filter, scale: float, name: str, unit: str) -> plot.Plot:
     """Amplitude density of motion and jitter, before and after."""
     whole = scale * np.sqrt(of.motion_density + of.jitter_density)
     some = whole > 0.0

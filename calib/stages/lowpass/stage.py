@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
     from calib.core.rig import Rig
     from calib.io.logs import Log
-    from calib.stages.lowpass.filters import Filter, Positions, Suggestion
+    from calib.stages.lowpass.filters import Filter
+    from calib.stages.lowpass.jitter import Positions, Suggestion
     from calib.stages.lowpass.section import Family, LowPass, LowPassLog
 
 _RATE_OFF = 0.05
@@ -97,7 +98,7 @@ def positions_from_log(
     """
     import numpy as np
 
-    from calib.stages.lowpass.filters import Positions, on_ticks, spectrum
+    from calib.stages.lowpass.jitter import Positions, on_ticks, spectrum
 
     signals = log.signals("u_px", "v_px")
     pixels = signals.values
@@ -165,20 +166,19 @@ def _read(files: Files, rig: Rig, options: Options) -> tuple[Any, ...]:
         made = design_lowpass(design)
     except BadInputError as error:
         raise UsageError(str(error)) from error
-    wanted, unit = options.jitter or (None, "")
-    if suggest is not None and wanted is not None and unit != suggest.unit:
-        asked = f"{1e3 * wanted:g}mm" if unit == "m" else f"{wanted:g}px"
-        has = "millimetres" if suggest.unit == "m" else "pixels, without a plane in the rig's file"
+    wanted = None if options.jitter is None else _jitter_in(suggest, *options.jitter)
+    orders = () if options.order is None else (options.order,)
+    families = () if options.family is None else (options.family,)
+    return made, rig.workspace_m, shown, suggest, wanted, orders, families
+
+
+def _jitter_in(positions: Positions | None, jitter: float, unit: str) -> float:
+    """A jitter that is asked for, in the positions' unit. Raises `UsageError` for another unit."""
+    if positions is not None and unit != positions.unit:
+        asked = f"{1e3 * jitter:g}mm" if unit == "m" else f"{jitter:g}px"
+        has = "millimetres" if positions.unit == "m" else "pixels, without a plane in the rig's file"
         raise UsageError(f"--jitter: {asked!r} does not fit positions in {has}")
-    return (
-        made,
-        rig.workspace_m,
-        shown,
-        suggest,
-        wanted,
-        () if options.order is None else (options.order,),
-        () if options.family is None else (options.family,),
-    )
+    return jitter
 
 
 def solve(
@@ -202,37 +202,28 @@ def solve(
 
     Raises `BadInputError` where no filter leaves so little jitter, or none is needed.
     """
-    import numpy as np
-
     from calib.core.result import judged
-    from calib.stages.lowpass import filters
+    from calib.stages.lowpass import filters, jitter
     from calib.stages.lowpass.section import LowPass, LowPassSection
 
     choice = None
     if suggest is not None:
-        spectra = suggest.spectra
         if wanted is None:
-            wanted = max(filters.jitter_after(of, made.sections) for of in spectra)
+            wanted = max(jitter.jitter_after(of, made.sections) for of in suggest.spectra)
         try:
-            choice = filters.suggest(spectra, wanted, orders, families, suggest.unit)
+            choice = jitter.suggest(suggest.spectra, wanted, orders, families, suggest.unit)
         except BadInputError as error:
             raise BadInputError(f"{suggest.source}: {error}") from error
         made = choice.best.filter
     design, sections, rate = made.design, made.sections, made.design.rate_hz
     rounded = filters.cutoff_hz(sections, rate)
     answer = filters.step_response(sections, rate)
-    f = sorted(
-        {c for c in (k * design.cutoff_hz for k in _TIMES_CUTOFF) if c < 0.5 * rate}
-        | {k * rate for k in _PARTS_OF_RATE}
-    )
-    gains = filters.decibels(filters.frequency_response(sections, np.array(f), rate))
-    band = np.linspace(0.0, design.cutoff_hz, 201)
     largest = max(abs(value) for value in workspace_m)
     float_mm = 1e3 * largest * filters.rest_error_binary32(made)
     log = None if positions is None else _log_section(made, positions)
-    findings = [*_of_rounding(made, rounded, float_mm)]
+    findings = [*_rounding_findings(made, rounded, float_mm)]
     if positions is not None and log is not None:
-        findings += _of_log(log, positions, choice is not None)
+        findings += _log_findings(log, positions, choice is not None)
     return LowPass(
         family=cast("Family", design.family),
         order=design.order,
@@ -243,9 +234,9 @@ def solve(
         pole_radius=made.pole_radius,
         poles=[[float(p.real), float(p.imag)] for p in filters.digital_poles(sections)],
         dc_delay_s=filters.dc_delay_s(sections, rate),
-        largest_delay_s=float(filters.group_delay_s(sections, band, rate).max()),
+        largest_delay_s=_largest_delay_s(made),
         step={"rise_s": answer.rise_s, "settling_s": answer.settling_s, "overshoot": answer.overshoot},
-        attenuation_db={f"{c:.4g}Hz": gain for c, gain in zip(f, gains.tolist(), strict=True)},
+        attenuation_db=_attenuation_db(made),
         noise_gain=filters.noise_gain(sections),
         dead_band_mm={"float": float_mm},
         wanted_jitter=wanted if wanted is None or positions is None else positions.scale * wanted,
@@ -254,8 +245,31 @@ def solve(
     ).with_evidence(Evidence(made, positions, choice))
 
 
+def _largest_delay_s(made: Filter) -> float:
+    """Largest group delay [s] up to the cut-off."""
+    import numpy as np
+
+    from calib.stages.lowpass.filters import group_delay_s
+
+    band_hz = np.linspace(0.0, made.design.cutoff_hz, 201)
+    return float(group_delay_s(made.sections, band_hz, made.design.rate_hz).max())
+
+
+def _attenuation_db(made: Filter) -> dict[str, float]:
+    """Gain [dB] at multiples of the cut-off and parts of the rate, by the frequency in words."""
+    import numpy as np
+
+    from calib.stages.lowpass.filters import decibels, frequency_response
+
+    rate = made.design.rate_hz
+    multiples = {k * made.design.cutoff_hz for k in _TIMES_CUTOFF}
+    hz = sorted({f for f in multiples if f < 0.5 * rate} | {k * rate for k in _PARTS_OF_RATE})
+    gains = decibels(frequency_response(made.sections, np.array(hz), rate))
+    return {f"{f:.4g}Hz": gain for f, gain in zip(hz, gains.tolist(), strict=True)}
+
+
 def _log_section(made: Filter, positions: Positions) -> LowPassLog:
-    from calib.stages.lowpass import filters
+    from calib.stages.lowpass import filters, jitter
     from calib.stages.lowpass.section import LowPassAxis, LowPassLog
 
     scale, ticks = positions.scale, positions.ticks
@@ -264,13 +278,13 @@ def _log_section(made: Filter, positions: Positions) -> LowPassLog:
     for i, (name, of) in enumerate(zip(positions.names, positions.spectra, strict=True)):
         # The grid is the picture's: u for x and v for y, which a camera that looks along the normal shows so.
         pixels = positions.pixels.longest.values[:, i]
-        step_px = filters.grid_step(pixels) if of.motion_hz > 0.0 else 0.0
-        f = filters.quantisation_hz(pixels, step_px, ticks.rate_hz)
+        step_px = jitter.grid_step(pixels) if of.motion_hz > 0.0 else 0.0
+        f = jitter.quantisation_hz(pixels, step_px, ticks.rate_hz)
         axes[name] = LowPassAxis(
             jitter_before=scale * of.jitter,
-            jitter_after=scale * filters.jitter_after(of, made.sections),
+            jitter_after=scale * jitter.jitter_after(of, made.sections),
             motion_hz=of.motion_hz,
-            motion_changed=filters.motion_lost(of, made.sections, delay_s),
+            motion_changed=jitter.motion_lost(of, made.sections, delay_s),
             quantisation_hz=f.tolist(),
             quantisation_db=filters.decibels(
                 filters.frequency_response(made.sections, f, ticks.rate_hz)
@@ -288,7 +302,7 @@ def _log_section(made: Filter, positions: Positions) -> LowPassLog:
     )
 
 
-def _of_rounding(made: Filter, rounded_hz: float, float_mm: float) -> Iterator[Finding]:
+def _rounding_findings(made: Filter, rounded_hz: float, float_mm: float) -> Iterator[Finding]:
     """Findings on what single precision makes of the filter."""
     asked_hz = made.design.cutoff_hz
     if abs(rounded_hz / asked_hz - 1.0) > _CUTOFF_OFF:
@@ -299,7 +313,7 @@ def _of_rounding(made: Filter, rounded_hz: float, float_mm: float) -> Iterator[F
         yield Finding("poor", f"In single precision the output comes to rest up to {float_mm:.2g} mm away.")
 
 
-def _of_log(log: LowPassLog, positions: Positions, chosen: bool) -> Iterator[Finding]:
+def _log_findings(log: LowPassLog, positions: Positions, chosen: bool) -> Iterator[Finding]:
     """Findings on what the filter does to a log; whether it was chosen by its jitter."""
     unsure = [name for name, of in zip(positions.names, positions.spectra, strict=True) if not of.flat]
     if unsure:
