@@ -524,6 +524,48 @@ def prospects(made: Fit) -> dict[str, dict[str, float]]:
     return out
 
 
+@dataclass(frozen=True)
+class _Chosen:
+    """The assembly that predicts held trials best.
+
+    Attributes
+    ----------
+    held, errors : fits to all trials but one and their errors on it, by its name.
+    others : held errors of assemblies that predict worse, by what is in them.
+    """
+
+    assembly: Assembly
+    scale: Scale
+    held: Mapping[str, Fit]
+    errors: Mapping[str, Errors]
+    others: Mapping[str, Mapping[str, Errors]]
+
+
+def _chosen(trials: Sequence[Trial], assembly: Assembly, drive: str, other_drive: str) -> _Chosen:
+    """The assembly with the one or the other drive, and with those of `_TRIED` that predict better."""
+    assembly = assembly.driven_by(drive)
+    scale, held = _held(trials, assembly, scale_of(trials))
+    errors = _held_errors(trials, held)
+    others: dict[str, Mapping[str, Errors]] = {}
+    if any(len(one.command) for one in trials):
+        driven = assembly.driven_by(other_drive)
+        fits = held_fits(trials, driven, scale, held)
+        by_other = _held_errors(trials, fits)
+        if mean_of(by_other, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
+            others[f"a {drive} for the {other_drive}"] = errors
+            assembly, held, errors = driven, fits, by_other
+        else:
+            others[f"a {other_drive} for the {drive}"] = by_other
+    for name in _TRIED if any(len(one.angle_rad) for one in trials) else ():
+        more = Assembly((*assembly.parts, name))
+        if _error(trials, held_fits(trials, more, scale)) <= _WORTHWHILE * _error(trials, held):
+            others[f"without {name}"] = errors
+            assembly = more
+            scale, held = _held(trials, assembly, replace(scale, finer=1.0))
+            errors = _held_errors(trials, held)
+    return _Chosen(assembly, scale, held, errors, others)
+
+
 def identify(
     trials: Sequence[Trial],
     compare: bool = True,
@@ -535,44 +577,29 @@ def identify(
     ----------
     compare : whether the parts' worth is measured, which takes as long again for each.
     """
-    scale = scale_of(trials)
     assembly = FULL if any(one.load_kg > 0.0 for one in trials) else FULL.without("load")
     # A regulator that follows its command is none of the valves that integrate, and a lag is no orifice.
     drive, other_drive = ("lag", "pump") if any(one.pwm for one in trials) else ("valve", "lag")
-    assembly = assembly.driven_by(drive)
-    scale, held = _held(trials, assembly, scale) if len(trials) > 1 else (scale, {})
-    errors = _held_errors(trials, held) if held else {}
-    others: dict[str, Mapping[str, Errors]] = {}
-    if held and any(len(one.command) for one in trials):
-        driven = assembly.driven_by(other_drive)
-        fits = held_fits(trials, driven, scale, held)
-        by_other = _held_errors(trials, fits)
-        if mean_of(by_other, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
-            others[f"a {drive} for the {other_drive}"] = errors
-            assembly, held, errors = driven, fits, by_other
-        else:
-            others[f"a {other_drive} for the {drive}"] = by_other
-    for name in _TRIED if held and any(len(one.angle_rad) for one in trials) else ():
-        more = Assembly((*assembly.parts, name))
-        if _error(trials, held_fits(trials, more, scale)) <= _WORTHWHILE * _error(trials, held):
-            others[f"without {name}"] = errors
-            assembly = more
-            scale, held = _held(trials, assembly, replace(scale, finer=1.0))
-            errors = _held_errors(trials, held)
-    variants = {f"without {name}": assembly.without(name) for name in WORTH if name in assembly.parts}
-    chosen = variants if compare and len(trials) > 1 else {}
-    steps = 2 + len(chosen)
+    if len(trials) == 1:
+        progress(1, 2)
+        made = fit(trials, assembly.driven_by(drive), scale_of(trials))
+        progress(2, 2)
+        return Identification(tuple(trials), made, _deviations(made, {}), {}, {}, math.nan, prospects(made))
+    chosen = _chosen(trials, assembly, drive, other_drive)
+    assembly, scale, held, others = chosen.assembly, chosen.scale, chosen.held, dict(chosen.others)
+    parts = [name for name in WORTH if name in assembly.parts] if compare else []
+    steps = 2 + len(parts)
     progress(1, steps)
     made = fit(trials, assembly, scale)
     progress(2, steps)
-    for k, (name, other) in enumerate(chosen.items()):
-        others[name] = _held_errors(trials, held_fits(trials, other, scale, held))
+    for k, name in enumerate(parts):
+        fits = held_fits(trials, assembly.without(name), scale, held)
+        others[f"without {name}"] = _held_errors(trials, fits)
         progress(3 + k, steps)
-    if len(trials) > 1:
-        others |= baselines(trials)
-    coverage = _coverage(trials, held, errors) if held else math.nan
+    others |= baselines(trials)
+    coverage = _coverage(trials, held, chosen.errors)
     sigma = _deviations(made, held)
-    return Identification(tuple(trials), made, sigma, errors, others, coverage, prospects(made))
+    return Identification(tuple(trials), made, sigma, chosen.errors, others, coverage, prospects(made))
 
 
 def best_baseline(found: Identification, quantity: str) -> str:
