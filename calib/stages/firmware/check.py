@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,15 @@ from calib.core.files import read_bytes, shown
 from calib.core.verdict import Finding, Verdict
 from calib.core.words import Block, InWords, Line, Table, counted, of_verdict
 from calib.io.serial import BOARD_COLUMNS, FAULTS, GUARD_RUN, Frame, Outputs, frame_from_row
-from calib.stages.firmware.conformance import BY_FUSED, BY_MEAN_RATE, CLAMPED, MARKER_HELD, reference_of
+from calib.stages.firmware.conformance import (
+    BY_FUSED,
+    BY_MEAN_RATE,
+    CLAMPED,
+    MARKER_HELD,
+    Reference,
+    Wanted,
+    reference_of,
+)
 from calib.stages.firmware.header import Header
 from calib.stages.firmware.vectors import TOLERANCE, tolerance
 
@@ -112,6 +120,23 @@ def _differences(out: Outputs, wanted: Outputs) -> dict[str, float]:
     return {name: value if math.isfinite(value) else math.inf for name, value in found.items()}
 
 
+def _reference_for(header: Header, first: Frame, source: str) -> Reference:
+    """The reference as the board runs it, told by its first frame. Raises as `check_frames`."""
+    if first.identity != header.identity:
+        raise BadInputError(
+            f"{source}: the board runs the constants {first.identity:08X}, rig.yaml gives "
+            f"{header.identity:08X}; write and flash the header again"
+        )
+    if first.sequence != 0:
+        raise BadInputError(
+            f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
+        )
+    fused, mean_rate = bool(first.out.flags & BY_FUSED), bool(first.out.flags & BY_MEAN_RATE)
+    if fused and not header.values["CALIB_HAS_FUSED"]:
+        raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
+    return reference_of(header.values, fused=fused, mean_rate=mean_rate)
+
+
 def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
     """Compare the ticks of a board with the reference.
 
@@ -123,48 +148,43 @@ def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
 
     Raises `BadInputError` for a board with another header and for a log that does not begin at the start.
     """
-    identity = header.identity
-    first = frames[0]
-    if first.identity != identity:
-        raise BadInputError(
-            f"{source}: the board runs the constants {first.identity:08X}, rig.yaml gives {identity:08X}; "
-            "write and flash the header again"
-        )
-    if first.sequence != 0:
-        raise BadInputError(
-            f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
-        )
-    by_fused, by_mean = bool(first.out.flags & BY_FUSED), bool(first.out.flags & BY_MEAN_RATE)
-    if by_fused and not header.values["CALIB_HAS_FUSED"]:
-        raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
-    reference = reference_of(header.values, fused=by_fused, mean_rate=by_mean)
+    reference = _reference_for(header, frames[0], source)
     worst, allowed, rounding_m = dict.fromkeys(TOLERANCE, 0.0), TOLERANCE, 0.0
-    differ, bad, ticks, lost = 0, None, 0, None
+    flags_differ, first_bad, missing_after = 0, None, None
     faults: dict[int, int] = {}
     for tick, frame in enumerate(frames):
         if frame.sequence != tick & 0xFFFF:
-            lost = tick
+            missing_after = tick
             break
         wanted = reference.step(frame.given, frame.out.flags)
-        found = _differences(frame.out, wanted)
         if not wanted.flags & MARKER_HELD:
             # Low-pass and controller remember it.
             rounding_m = max(rounding_m, reference.rounding_m(frame.given.u_px, frame.given.v_px))
             allowed = tolerance(rounding_m)
-        over = [name for name, value in found.items() if value > allowed[name]]
-        if (frame.out.flags ^ wanted.flags) & ~_CLAMP_BITS:
-            differ += 1
-            over.append("flags")
-        if wanted.undecided_pwm > allowed["pwm"]:
-            over.append("the decision to clamp")
-        if wanted.undecided_m > _UNDECIDED_M:
-            over.append("the decision on rest, motion or a marker to leave out")
-        if not _driven(frame):
-            over.append("what drives the pumps")
+        off = _differences(frame.out, wanted)
+        worst = {name: max(worst[name], value) for name, value in off.items()}
+        flags_differ += _flags_differ(frame, wanted)
+        wrong = [name for name, value in off.items() if value > allowed[name]]
+        wrong += _wrong_decisions(frame, wanted, allowed)
+        if wrong and first_bad is None:
+            first_bad = (tick, wrong[0])
         if frame.guard is not None and frame.guard.fault:
             faults.setdefault(frame.guard.fault, tick)
-        if over and bad is None:
-            bad = (tick, over[0])
-        worst = {name: max(worst[name], value) for name, value in found.items()}
-        ticks += 1
-    return Check(ticks, lost, worst, allowed, differ, bad, faults)
+    ticks = len(frames) if missing_after is None else missing_after
+    return Check(ticks, missing_after, worst, allowed, flags_differ, first_bad, faults)
+
+
+def _flags_differ(frame: Frame, wanted: Wanted) -> bool:
+    return bool((frame.out.flags ^ wanted.flags) & ~_CLAMP_BITS)
+
+
+def _wrong_decisions(frame: Frame, wanted: Wanted, allowed: Mapping[str, float]) -> Iterator[str]:
+    """Decisions of a tick that are not the reference's, beyond what rounding explains."""
+    if _flags_differ(frame, wanted):
+        yield "flags"
+    if wanted.undecided_pwm > allowed["pwm"]:
+        yield "the decision to clamp"
+    if wanted.undecided_m > _UNDECIDED_M:
+        yield "the decision on rest, motion or a marker to leave out"
+    if not _driven(frame):
+        yield "what drives the pumps"

@@ -130,7 +130,20 @@ def _limits(constants: Mapping[str, float], still: Inputs, fused: bool) -> list[
     """
     rest = constants["CALIB_REST_LENGTH_M"]
     still = replace(still, gz_radps=0.0, mode=MODE_POSITION, reference=(1.1 * rest, 1.12 * rest))
-    hold, nan = int(constants["CALIB_HOLD_TICKS"]), math.nan
+    steady = replace(still, gz_radps=constants["CALIB_IMU_GYRO_BIAS_RADPS"], mode=MODE_OFF)
+    made = [
+        *_losses(constants, still),
+        *_refused(constants, still, fused),
+        *_rests(constants, steady, fused),
+        *_held_integral(constants, steady),
+        *_fast_turns(constants, still),
+    ]
+    return [(binary32(given), times) for given, times in made]
+
+
+def _losses(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs, int]]:
+    """Sensors that fall silent for as long as is held, and longer."""
+    hold = int(constants["CALIB_HOLD_TICKS"])
     made: list[tuple[Inputs, int]] = []
     for silent in (replace(still, marker_seen=False), replace(still, imu_read=False)):
         made += [(still, 2), (silent, hold), (silent, 1), (still, 1)]
@@ -142,7 +155,12 @@ def _limits(constants: Mapping[str, float], still: Inputs, fused: bool) -> list[
     boost = int(constants.get("CALIB_FUSED_BOOST_TICKS", 0))
     away = replace(still, u_px=_elsewhere(still.u_px))
     lost = replace(still, marker_seen=False, mode=MODE_OFF)
-    made += [(still, boost + 2), (lost, hold - 1), (away, 2), (still, 1)]
+    return [*made, (still, boost + 2), (lost, hold - 1), (away, 2), (still, 1)]
+
+
+def _refused(constants: Mapping[str, float], still: Inputs, fused: bool) -> list[tuple[Inputs, int]]:
+    """Readings, references and a mode that are refused, and those that are just not."""
+    nan = math.nan
     edge = constants.get("CALIB_CAMERA_GREATEST_U_PX", 0.0), constants.get("CALIB_CAMERA_GREATEST_V_PX", 0.0)
     changes: list[dict[str, Any]] = [
         *({name: nan} for name in ("u_px", "v_px", "ax_mps2", "ay_mps2", "gz_radps")),
@@ -156,35 +174,44 @@ def _limits(constants: Mapping[str, float], still: Inputs, fused: bool) -> list[
         *(_weak(constants, factor, fused) for factor in (0.995, 1.005)),
         {"mode": 7},
     ]
+    made: list[tuple[Inputs, int]] = []
     for k, change in enumerate(changes):
         made += [(replace(still, **change), 1), *[(still, 1)] * (k % 3 == 2)]
-    # At rest, and then a little beside: told from a motion.
-    steady = replace(still, gz_radps=constants["CALIB_IMU_GYRO_BIAS_RADPS"], mode=MODE_OFF)
-    made.append((steady, 150))
+    return made
+
+
+def _rests(constants: Mapping[str, float], steady: Inputs, fused: bool) -> list[tuple[Inputs, int]]:
+    """At rest, and then a little beside: told from a motion."""
+    made = [(steady, 150)]
     if fused:
         # Not yet a motion, for about as long as the gain at rest takes.
         made.append((_farther(constants, steady, 0.8 * constants["CALIB_FUSED_MOVING_M"]), 110))
-    made.append((replace(steady, v_px=still.v_px + 0.5), 3))
-    half = constants["CALIB_ORIENTATION_KI_HALF_DT_PWM_PER_RAD"]
-    if half > 0.0 and constants["CALIB_ORIENTATION_CLAMPING"]:
-        # The integral comes to the limit within `_TO_LIMIT` ticks, and is left out from there.
-        proportional = constants["CALIB_ORIENTATION_KPDI_PWM_PER_RAD"] - half
-        proportional -= constants["CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD"]
-        e = constants["CALIB_PUMP_HIGH_PWM"] / (proportional + 2 * _TO_LIMIT * half)
-        bias = (constants[f"CALIB_IMU_ACCEL_BIAS_{axis}_MPS2"] for axis in "XY")
-        ax, ay = (value - by for value, by in zip((still.ax_mps2, still.ay_mps2), bias, strict=True))
-        phi = math.atan2(constants["CALIB_IMU_ACCEL_RATIO"] * ay, ax) - constants["CALIB_IMU_MOUNT_ANGLE_RAD"]
-        wanted = replace(steady, reference=(phi + e, 0.0), mode=MODE_ORIENTATION)
-        made.append((wanted, _TO_LIMIT + 10))
-    # The head turns through both limits of its angle, by a third of a radian in a tick.
-    per_60hz = constants["CALIB_TICK_RATE_HZ"] / 60.0
+    return [*made, (replace(steady, v_px=steady.v_px + 0.5), 3)]
+
+
+def _held_integral(c: Mapping[str, float], steady: Inputs) -> list[tuple[Inputs, int]]:
+    """The integral comes to the limit within `_TO_LIMIT` ticks, and is left out from there."""
+    half = c["CALIB_ORIENTATION_KI_HALF_DT_PWM_PER_RAD"]
+    if not (half > 0.0 and c["CALIB_ORIENTATION_CLAMPING"]):
+        return []
+    proportional = c["CALIB_ORIENTATION_KPDI_PWM_PER_RAD"] - half
+    proportional -= c["CALIB_ORIENTATION_KD_PER_DT_PWM_PER_RAD"]
+    e = c["CALIB_PUMP_HIGH_PWM"] / (proportional + 2 * _TO_LIMIT * half)
+    bias = (c[f"CALIB_IMU_ACCEL_BIAS_{axis}_MPS2"] for axis in "XY")
+    ax, ay = (value - by for value, by in zip((steady.ax_mps2, steady.ay_mps2), bias, strict=True))
+    phi = math.atan2(c["CALIB_IMU_ACCEL_RATIO"] * ay, ax) - c["CALIB_IMU_MOUNT_ANGLE_RAD"]
+    return [(replace(steady, reference=(phi + e, 0.0), mode=MODE_ORIENTATION), _TO_LIMIT + 10)]
+
+
+def _fast_turns(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs, int]]:
+    """The head turns through both limits of its angle, by a third of a radian in a tick."""
+    made, per_60hz = [], constants["CALIB_TICK_RATE_HZ"] / 60.0
     fast = 20.0 * min(per_60hz, 1.0)
     for rate, ticks in ((-fast, 8), (fast, 14)):
         turns = replace(still, gz_radps=rate, reference=(0.3, 0.0), mode=MODE_ORIENTATION)
         made.append((replace(turns, marker_seen=False), math.ceil(ticks * max(per_60hz, 1.0))))
     # From there it is nearer to the accelerometer's angle the other way round.
-    made.append((replace(still, ax_mps2=-9.07, ay_mps2=3.74, gz_radps=-fast), 1))
-    return [(binary32(given), times) for given, times in made]
+    return [*made, (replace(still, ax_mps2=-9.07, ay_mps2=3.74, gz_radps=-fast), 1)]
 
 
 def _farther(constants: Mapping[str, float], still: Inputs, by_m: float) -> Inputs:
