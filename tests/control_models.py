@@ -8,7 +8,7 @@ from source_model import PolynomialForce
 
 from calib.stages.actuator.parameters import pumps_connected
 from calib.stages.actuator.pump import Orifice, Pump
-from calib.stages.control.laws import Model
+from calib.stages.control.rig_model import Model
 
 NOMINAL = Model(pumps_connected(), Pump())
 ORIFICE = Model(pumps_connected(), Pump(deflation=Orifice()))

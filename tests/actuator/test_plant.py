@@ -32,7 +32,7 @@ from calib.stages.actuator.pump import (
     settling_force_N,
     static_force_N,
 )
-from calib.stages.control.laws import Model, PumpEstimate, pumps_at_rest, push
+from calib.stages.control.rig_model import Model, PumpEstimate, pumps_at_rest, push
 
 
 def test_nominal_values() -> None:

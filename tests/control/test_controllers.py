@@ -22,30 +22,29 @@ from calib.stages.control.laws import (
     Channel,
     ComputedTorque,
     FeedForward,
-    Model,
-    Observer,
     Pid,
+    computed_torque_step,
+    feed_forward,
+    step_back,
+    wanted_motion,
+)
+from calib.stages.control.observer import Observer, design_observer, marker_jacobian, marker_of
+from calib.stages.control.references import Ellipse
+from calib.stages.control.rig_model import (
+    Model,
     PumpEstimate,
     ahead,
-    computed_torque_step,
-    design_observer,
-    feed_forward,
     feed_forward_pwm,
     force_of_pwm,
     holding_force,
     largest_force_N,
-    marker_jacobian,
-    marker_of,
     moving_force,
     pumps_at_rest,
     push,
     pwm_for_force,
     pwm_of_force,
     static_stiffness,
-    step_back,
-    wanted_motion,
 )
-from calib.stages.control.references import Ellipse
 
 
 def _outputs(pid: Pid, errors: list[float]) -> np.ndarray:

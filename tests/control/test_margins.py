@@ -15,7 +15,7 @@ from scipy import signal
 
 from calib.core.errors import BadInputError
 from calib.stages.actuator.simulate import RigState
-from calib.stages.control.laws import Channel, Model, Pid, bent_rest, feed_forward_pwm, holding_force
+from calib.stages.control.laws import Channel, Pid
 from calib.stages.control.loops import (
     System,
     break_at,
@@ -29,6 +29,7 @@ from calib.stages.control.loops import (
     spectral_radius,
 )
 from calib.stages.control.reach import approach_s, follow, largest_angle
+from calib.stages.control.rig_model import Model, bent_rest, feed_forward_pwm, holding_force
 from calib.stages.control.section import ControllerCriterion
 from calib.stages.control.tuning import (
     Tuned,

@@ -17,7 +17,6 @@ from open_loop import simulate
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.stages.actuator.kinematics import angle, forward
-from calib.stages.control.laws import Model, feed_forward_pwm
 from calib.stages.control.reach import follow, largest_angle, longest_m, reachable, slowed
 from calib.stages.control.read import read_reference, recorded_reference
 from calib.stages.control.references import (
@@ -28,6 +27,7 @@ from calib.stages.control.references import (
     from_angles,
     resampled,
 )
+from calib.stages.control.rig_model import Model, feed_forward_pwm
 from calib.stages.estimator import replay
 
 H = NOMINAL.tick_s

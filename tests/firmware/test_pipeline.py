@@ -19,12 +19,7 @@ from ticks import Ticks, run_gains
 import calib
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.camera.model import Camera, undistort
-from calib.stages.control.laws import (
-    Channel,
-    FeedForward,
-    Pid,
-    feed_forward,
-)
+from calib.stages.control.laws import Channel, FeedForward, Pid, feed_forward
 from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.firmware.conformance import (
     ACCEL_WEAK,

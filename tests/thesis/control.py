@@ -18,14 +18,9 @@ from calib.core.arrays import FloatArray
 from calib.core.plot import Band, Curve, Plot
 from calib.stages.actuator.kinematics import forward, inverse
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
-from calib.stages.control.laws import (
-    PWM_MIN,
-    Channel,
-    FeedForward,
-    Pid,
-    feed_forward,
-)
+from calib.stages.control.laws import Channel, FeedForward, Pid, feed_forward
 from calib.stages.control.references import Ellipse, PolynomialElongation
+from calib.stages.control.rig_model import PWM_MIN
 from calib.twin.scenarios import StepResponse, at_rest, length_law, step_response
 from calib.twin.simulate import Run, simulate
 from thesis.plot import curve, curves_of

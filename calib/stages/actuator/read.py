@@ -25,7 +25,7 @@ from calib.stages.actuator.kinematics import angle_and_length, bellows
 from calib.stages.actuator.machine import Machine
 from calib.stages.actuator.parameters import TICK_S, Plant
 from calib.stages.actuator.swing import without_outliers
-from calib.stages.control.laws import holding_force
+from calib.stages.control.rig_model import holding_force
 from calib.stages.estimator.read import periods, setup_from_rig
 from calib.stages.estimator.sensors import GRAVITY_MPS2, SIZE, heads_seen, marker
 

@@ -1,27 +1,34 @@
-"""Control laws: PID, feed-forward, anti-windup, observer, computed torque, and one step of them all."""
+"""Control laws: PID with clamping and with back-calculation, feed-forward, computed torque."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 
 from calib.core.arrays import FloatArray
-from calib.core.errors import BadInputError
-from calib.stages.actuator import dynamics, kinematics
-from calib.stages.actuator.parameters import TICK_S, Plant
+from calib.stages.actuator import dynamics
+from calib.stages.actuator.parameters import TICK_S
 from calib.stages.actuator.pump import (
     PWM_MAX,
-    Orifice,
-    Pump,
-    advance_pump,
-    pump_coefficients,
-    static_force_N,
 )
-from calib.stages.actuator.simulate import derivative, largest_step_s
+from calib.stages.control.observer import Observer
+from calib.stages.control.rig_model import (
+    PWM_MIN,
+    Model,
+    Pair,
+    ahead,
+    creep_along,
+    falling_rate,
+    largest_force_N,
+    least_pwm,
+    moving_force,
+    pumps_at_rest,
+    push,
+    pwm_for_force,
+    pwm_of_force,
+)
 
 # ----------------------------------------------------------------------
 # The discrete PID controller with integrator clamping (4.4, D.1 - D.9).
@@ -48,9 +55,6 @@ from calib.stages.actuator.simulate import derivative, largest_step_s
 #   (4.1.1), and that value is both the output and the next u_(k-1): the tick adds nothing to the sum.
 #
 # A controller has one channel for each bellows.
-
-PWM_MIN = 0.0
-"""Limits of what the microcontroller can put out, 0 V to 12 V, with `PWM_MAX`."""
 
 
 @dataclass(frozen=True)
@@ -110,304 +114,6 @@ class Channel:
 def saturate(u: float, low: float = PWM_MIN, high: float = PWM_MAX) -> float:
     """What reaches the motor [PWM]: limited, and a whole number as the PWM register holds one."""
     return math.floor(min(max(u, low), high) + 0.5)
-
-
-# ----------------------------------------------------------------------
-# The identified model read backwards: forces that hold or move the bellows, and the PWM that gives them.
-#
-# Without motion the equations of `calib.stages.actuator.dynamics` leave the forces of the pumps as
-#
-#     P F = N(q, 0),                                                                      (3.43), (3.37)
-#
-# springs with bending and gravity, for any two lengths. The source's feed-forward (4.6) is a line through
-# the steady elongation with both motors alike, which holds for stretching without bending only. In
-# motion
-#
-#     P F = M(q) ddq + C(q, dq) dq + N(q, dq) - lambda3 z.                                 (3.33), (3.46)
-#
-# The static force of a pump is turned around on a table of whole and quarter PWM values. It is zero in
-# the dead zone, so that every force above zero needs a PWM above it, and a falling piece of the printed
-# polynomials, where there is one, is passed over to the next value that gives more.
-
-_STEP_PWM = 0.25
-
-
-@dataclass(frozen=True)
-class Model:
-    """The identified rig as controllers know it.
-
-    Attributes
-    ----------
-    plant, pump : as identified.
-    strength : factors on the static forces of the two pumps.
-    low_pwm, high_pwm : limits of the command [PWM].
-    latency_s : from the exposure of a picture to the tick that reads it.
-    lowpass : second-order sections (b0, b1, b2, 1, a1, a2) of the board's low-pass; none for the usual one.
-
-    Raises `BadInputError` for limits that the motors do not have or with which no pump gives any force.
-    """
-
-    plant: Plant
-    pump: Pump
-    strength: tuple[float, float] = (1.0, 1.0)
-    low_pwm: float = PWM_MIN
-    high_pwm: float = PWM_MAX
-    latency_s: float = 0.025
-    lowpass: tuple[tuple[float, ...], ...] = ()
-
-    def __post_init__(self) -> None:
-        whole = float(self.low_pwm).is_integer() and float(self.high_pwm).is_integer()
-        if not PWM_MIN <= self.low_pwm < self.high_pwm <= PWM_MAX or not whole:
-            raise BadInputError(
-                f"PWM limits: found {self.low_pwm:g} to {self.high_pwm:g}, expected "
-                f"whole numbers, {PWM_MIN:g} <= low < high <= {PWM_MAX:g}"
-            )
-        for i, strength in enumerate(self.strength):
-            if not strength > 0.0:
-                raise BadInputError(
-                    f"strength of pump {i + 1}: found {strength:g}, expected a positive factor"
-                )
-        if float(np.max(static_force_N(self.pump, np.array([self.high_pwm])))) <= 0.0:
-            raise BadInputError(
-                f"PWM limits: at {self.high_pwm:g} the pumps give no force yet, expected a limit above "
-                "their dead zone"
-            )
-
-    @property
-    def tick_s(self) -> float:
-        """Period of the commands."""
-        return self.pump.tick_s
-
-
-@lru_cache(maxsize=32)
-def _table(pump: Pump, low: float, high: float) -> tuple[FloatArray, FloatArray]:
-    """Rising forces [N] and the PWM values that give them, the first at zero force."""
-    pwm = np.unique(np.append(np.arange(low, high, _STEP_PWM), high))
-    force = np.maximum.accumulate(static_force_N(pump, pwm))
-    rising = np.concatenate([np.diff(force) > 0.0, [False]])
-    # The last value of the dead zone, then every value that gives more than all before it.
-    keep = np.concatenate([[False], np.diff(force) > 0.0]) | (rising & (force == force[0]))
-    if not keep.any():
-        keep[-1] = True
-    return force[keep], pwm[keep]
-
-
-def force_of_pwm(model: Model, pwm: FloatArray) -> FloatArray:
-    """Force (..., 2) [N] that PWM values (..., 2) settle at, within the limits of the command."""
-    limited = np.clip(np.asarray(pwm, dtype=np.float64), model.low_pwm, model.high_pwm)
-    return np.asarray(static_force_N(model.pump, limited) * np.array(model.strength))
-
-
-def largest_force_N(model: Model) -> FloatArray:
-    """Greatest steady force (2,) [N] of the pumps."""
-    force, _ = _table(model.pump, model.low_pwm, model.high_pwm)
-    return np.asarray(force[-1] * np.array(model.strength))
-
-
-def pwm_of_force(model: Model, force_N: FloatArray) -> FloatArray:
-    """PWM values (..., 2) whose steady forces are the nearest to these (..., 2) [N].
-
-    `low_pwm` for no force at all; for one that the pumps do not reach, the value that gives most.
-    """
-    force, pwm = _table(model.pump, model.low_pwm, model.high_pwm)
-    wanted = np.asarray(force_N, dtype=np.float64) / np.array(model.strength)
-    found = np.interp(wanted, force, pwm)
-    return np.asarray(np.where(wanted <= force[0], model.low_pwm, found))
-
-
-def holding_force(plant: Plant, q_m: FloatArray) -> FloatArray:
-    """Forces (..., 2) [N] that hold the bellows at the lengths (..., 2) [m] after all creep."""
-    q = np.asarray(q_m, dtype=np.float64)
-    return dynamics.resisting_forces(plant, q, np.zeros_like(q))
-
-
-def moving_force(
-    plant: Plant, q_m: FloatArray, dq_mps: FloatArray, ddq_mps2: FloatArray, z_N: FloatArray
-) -> FloatArray:
-    """Forces (..., 2) [N] that move the bellows so, with creep forces z (..., 2) [N]; all (..., 2)."""
-    q, dq = np.asarray(q_m, dtype=np.float64), np.asarray(dq_mps, dtype=np.float64)
-    inertia = np.einsum("...rc,...c->...r", dynamics.mass_matrix(plant, q), np.asarray(ddq_mps2))
-    swept = np.einsum("...rc,...c->...r", dynamics.coriolis_matrix(plant, q, dq), dq)
-    crept = plant.creep_rates[2] * np.asarray(z_N)
-    return np.asarray(inertia + swept + dynamics.resisting_forces(plant, q, dq) - crept)
-
-
-def creep_along(plant: Plant, tick_s: float, dq_mps: FloatArray) -> FloatArray:
-    """Creep forces z (n, 2) [N] along rates (n, 2) [m/s] at evenly spaced times, from zero (3.45).
-
-    Exact for rates that are straight lines between the times.
-    """
-    l1, l2, _ = plant.creep_rates
-    dq = np.asarray(dq_mps, dtype=np.float64)
-    z = np.zeros_like(dq)
-    if l2 == 0.0:
-        return z
-    w = l1 * tick_s
-    decay = np.exp(-w)
-    if w > 1e-6:
-        whole = (1.0 - decay) / l1
-        late = (1.0 - whole / tick_s) / l1
-    else:
-        whole, late = tick_s, 0.5 * tick_s
-    for k in range(1, len(dq)):
-        z[k] = decay * z[k - 1] + l2 * ((whole - late) * dq[k - 1] + late * dq[k])
-    return z
-
-
-def bent_rest(model: Model, phi_rad: float) -> FloatArray:
-    """Lengths (2,) [m] at rest at an angle [rad] with one pump alone.
-
-    Raises `BadInputError` for an angle at which no length satisfies this.
-    """
-    from scipy.optimize import brentq
-
-    plant = model.plant
-    r, idle = plant.bellows_radius_m, 1 if phi_rad >= 0.0 else 0
-
-    def rest(l: float) -> float:  # noqa: E741  the source's symbol
-        return float(holding_force(plant, kinematics.bellows(phi_rad, l, r))[idle])
-
-    low, high = max(abs(r * phi_rad) * 1.001, 0.2 * plant.rest_length_m), 3.0 * plant.rest_length_m
-    if not (low < high and rest(low) < 0.0 < rest(high)):
-        raise BadInputError(
-            f"angle: found {phi_rad:g} rad, at which no length is at rest with one pump, expected a "
-            "smaller one"
-        )
-    return kinematics.bellows(phi_rad, float(brentq(rest, low, high, xtol=1e-12)), r)
-
-
-def static_stiffness(plant: Plant, q_m: FloatArray) -> FloatArray:
-    """dF/dq (2, 2) [N/m] of `holding_force` at the lengths (2,)."""
-    A = dynamics.linearised(plant, q_m)
-    return np.asarray(-dynamics.mass_matrix(plant, q_m) @ A[2:4, :2])
-
-
-def feed_forward_pwm(model: Model, q_ref_m: FloatArray) -> FloatArray:
-    """PWM (..., 2) that holds the lengths (..., 2) [m], in both bellows and with bending."""
-    return pwm_of_force(model, holding_force(model.plant, q_ref_m))
-
-
-# ----------------------------------------------------------------------
-# The pumps as a controller follows them: no sensor sees the air, but what was commanded is known.
-#
-# The state is that of `calib.stages.actuator.pump`: output of the lag, force on the bellows, and commands
-# on their way. It follows from the commands alone, rounding and saturation included.
-#
-# Reading the lag backwards. A static force g held for the time T takes the lag from x to g + (x - g) a,
-# a = exp(-T / tau), so that
-#
-#     g = (x* - a x) / (1 - a)
-#
-# takes it to x*. T is a horizon of some ticks and not one: over one tick the inverse multiplies noise by
-# 1 / (1 - a) = 42, over six by 7.5. A force cannot fall faster than the orifice lets the air out. A lag
-# that is sent below the force then has to come back before the force rises again; so x* is never less
-# than what the force can have come down to.
-
-Pair = tuple[float, float]
-
-_IDLE_N = 0.02
-"""Less is noise: 0.4 mm of a nominal bellows."""
-
-
-@dataclass(frozen=True)
-class PumpEstimate:
-    """Both pumps at a tick.
-
-    Attributes
-    ----------
-    lag_N, force_N : output of the lags and forces on the bellows.
-    waiting_pwm : commands on their way, oldest first.
-    """
-
-    lag_N: Pair = (0.0, 0.0)
-    force_N: Pair = (0.0, 0.0)
-    waiting_pwm: tuple[Pair, ...] = ()
-
-
-def pumps_at_rest(model: Model) -> PumpEstimate:
-    """Pumps off for long."""
-    return PumpEstimate(waiting_pwm=((0.0, 0.0),) * model.pump.delay_ticks)
-
-
-@lru_cache(maxsize=4096)
-def _arriving(model: Model, pwm: Pair) -> Pair:
-    g1, g2 = force_of_pwm(model, np.array(pwm)).tolist() if any(pwm) else (0.0, 0.0)
-    return g1, g2
-
-
-def _after(model: Model, state: PumpEstimate, pwm: Pair) -> tuple[Pair, Pair]:
-    dt = model.tick_s
-    (x1, _, F1), (x2, _, F2) = (
-        advance_pump(p, lag, force, g, math.exp(-0.5 * dt / p.lag_s), dt)
-        for p, lag, force, g in zip(
-            pump_coefficients(model.pump), state.lag_N, state.force_N, _arriving(model, pwm), strict=True
-        )
-    )
-    return (x1, x2), (F1, F2)
-
-
-def push(model: Model, state: PumpEstimate, pwm: Pair) -> PumpEstimate:
-    """State one tick after a new command, which takes effect `delay_ticks` later."""
-    queue = (*state.waiting_pwm, pwm)
-    lag, force = _after(model, state, queue[0])
-    return PumpEstimate(lag, force, queue[1:])
-
-
-def ahead(model: Model, state: PumpEstimate) -> list[PumpEstimate]:
-    """States at the ticks at which the commands on their way have acted one by one, the present first."""
-    states = [state]
-    for i, pwm in enumerate(state.waiting_pwm):
-        lag, force = _after(model, states[-1], pwm)
-        states.append(PumpEstimate(lag, force, state.waiting_pwm[i + 1 :]))
-    return states
-
-
-def falling_rate(model: Model, force_N: FloatArray) -> FloatArray:
-    """Fastest fall [N/s] at the forces (...) [N]: that of the rate limit or of the orifice."""
-    law, F = model.pump.deflation, np.maximum(np.asarray(force_N, dtype=np.float64), 0.0)
-    if isinstance(law, Orifice):
-        a, b = law.laminar_s, law.turbulent_s2_per_N
-        # With the valve open the pump can slow this down, never speed it up.
-        return np.asarray(2.0 * F / (a + np.sqrt(a * a + 4.0 * b * F)))
-    return np.full_like(F, law.falling_N_per_s)
-
-
-def least_pwm(model: Model, state: PumpEstimate, share: float) -> Pair:
-    """Commands (2,) below which the lag would run ahead of a force that cannot fall any faster.
-
-    A lag at rest at F - share R tau falls with the share R of the rate there, R that of `falling_rate`.
-
-    Parameters
-    ----------
-    state : of the pumps when the command arrives, the last of `ahead`.
-    share : 0 holds the force, 1 lets it fall as fast as it can.
-    """
-    F = np.array(state.force_N)
-    floor = np.maximum(F - share * np.array(model.pump.lags_s) * falling_rate(model, F), 0.0)
-    low = pwm_of_force(model, floor).tolist()
-    return low[0], low[1]
-
-
-def pwm_for_force(model: Model, state: PumpEstimate, wanted_N: FloatArray, horizon_ticks: int) -> FloatArray:
-    """Commands (2,) [PWM], not rounded, that take the forces to `wanted_N` (2,) in some ticks.
-
-    Parameters
-    ----------
-    state : of the pumps when the command arrives.
-
-    While a force is wanted a command stays above the dead zone even where it gives none for a moment: the
-    same force, without switching the motor off and on. A pump of which nothing is wanted is off.
-    """
-    T = horizon_ticks * model.tick_s
-    F = np.array(state.force_N)
-    # With an orifice the lag acts on the force itself.
-    x = F if isinstance(model.pump.deflation, Orifice) else np.array(state.lag_N)
-    target = np.maximum(np.asarray(wanted_N), F - T * falling_rate(model, F))
-    a = np.exp(-T / np.array(model.pump.lags_s))
-    pwm = pwm_of_force(model, (target - a * x) / (1.0 - a))
-    edge = pwm_of_force(model, np.full(2, 1e-9))
-    idle = (np.asarray(wanted_N) < _IDLE_N) & (F < _IDLE_N)
-    return np.where(idle, model.low_pwm, np.maximum(pwm, edge))
 
 
 # ----------------------------------------------------------------------
@@ -507,172 +213,6 @@ def feed_forward(parameters: FeedForward, q_ref_m: FloatArray) -> FloatArray:
     q = np.asarray(q_ref_m, dtype=np.float64)
     line = parameters.slope_pwm_per_m * (q - parameters.from_m) + parameters.offset_pwm
     return np.where(q < parameters.from_m, 0.0, np.minimum(line, parameters.limit_pwm))
-
-
-# ----------------------------------------------------------------------
-# Lengths, rates, creep and disturbing forces from PWM, marker and gyroscope, on the identified model.
-#
-#     x = (q, dq, z, d, b):  the plant of `calib.stages.actuator.dynamics` driven by the pumps' forces plus
-# d,
-#                            dd/dt = noise,  db/dt = noise
-#     marker  m = p(q) + offset (sin phi, cos phi), exposed one latency before the tick         (A.1)
-#     gyro   -gz = dphi + b
-#
-# The prediction is the nonlinear model, the correction a constant gain L: that of the stationary Kalman
-# filter of the model linearised at one point, sampled at the ticks. The marker's innovation is taken
-# against the prediction at the time of the exposure and turned into lengths by the Jacobian there. A
-# marker farther away than the gate is not believed.
-#
-# d takes up what the model does not explain, at rest all of it, which is what makes a controller that
-# subtracts it free of static error.
-
-STATES = 9
-
-
-_MARKER_M, _GYRO_RADPS = 2.5e-4, 0.003
-"""Standard deviations of the marker along each axis, and of the mean of a tick's rates."""
-_FORCE_N_PER_SQRT_S, _BIAS_RADPS_PER_SQRT_S, _ACCEL_MPS2_PER_SQRT_HZ = 0.03, 3e-3, 0.05
-"""Walks of d and b, and density of what pushes the head unseen."""
-_GATE_M = 4e-3
-"""Largest innovation of a marker that is believed."""
-_AT_M = 0.012
-"""Elongation at which the gain is designed, in the middle of the workspace."""
-
-
-class Observer:
-    """An observer with its memory, straight at rest with the pumps off at the start.
-
-    Attributes
-    ----------
-    model : the identified rig.
-    gain : (9, 3) L, columns q1, q2 [m] and the gyroscope [rad/s].
-    latency_s : from the exposure to the tick that reads the marker. marker_offset_m : of (A.1).
-    y : (6,) q, dq, z. d_N : (2,). bias_radps : b.
-    pumps : their state.
-    """
-
-    def __init__(self, model: Model, gain: FloatArray, latency_s: float, marker_offset_m: float) -> None:
-        self.model, self.gain = model, gain
-        self.latency_s, self.marker_offset_m = latency_s, marker_offset_m
-        self.y = np.array([model.plant.rest_length_m] * 2 + [0.0] * 4)
-        self.d_N, self.bias_radps, self.pumps = np.zeros(2), 0.0, pumps_at_rest(model)
-        # Lengths at this tick and those before, the newest first.
-        self._past_q = np.tile(self.y[:2], (2 + math.ceil(latency_s / model.tick_s), 1))
-        self._refused = 0
-
-    def _advanced(self, y: FloatArray, before: PumpEstimate, after: PumpEstimate) -> FloatArray:
-        """Plant (6,) after a tick in which the pumps' forces go in a straight line."""
-        c, tick_s = dynamics.coefficients(self.model.plant), self.model.tick_s
-        steps = max(4, math.ceil(1.5 * tick_s / largest_step_s(self.model.plant)))
-        h, d = tick_s / steps, self.d_N
-        start, end = np.array(before.force_N) + d, np.array(after.force_N) + d
-        for i in range(steps):
-            a, b = start + (end - start) * (i / steps), start + (end - start) * ((i + 1) / steps)
-            m = 0.5 * (a + b)
-            k1 = derivative(c, y, a[0], a[1])
-            k2 = derivative(c, y + 0.5 * h * k1, m[0], m[1])
-            k3 = derivative(c, y + 0.5 * h * k2, m[0], m[1])
-            k4 = derivative(c, y + h * k3, b[0], b[1])
-            y = y + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-        return y
-
-    def predict(self, pwm: Pair) -> None:
-        """Go on to the next tick after a command, without new readings."""
-        pumps = push(self.model, self.pumps, pwm)
-        self.y, self.pumps = self._advanced(self.y, self.pumps, pumps), pumps
-        self._past_q = np.vstack([self.y[:2], self._past_q[:-1]])
-
-    def look_ahead(self) -> tuple[FloatArray, PumpEstimate]:
-        """Plant (6,) and pumps at the tick at which the next command arrives."""
-        y, pumps = self.y, ahead(self.model, self.pumps)
-        for before, after in pairwise(pumps):
-            y = self._advanced(y, before, after)
-        return y, pumps[-1]
-
-    def _exposed(self) -> FloatArray:
-        late = self.latency_s / self.model.tick_s
-        i = min(int(late), len(self._past_q) - 2)
-        return np.asarray((1.0 - (late - i)) * self._past_q[i] + (late - i) * self._past_q[i + 1])
-
-    def correct(self, marker_m: Pair, minus_gz_radps: float) -> None:
-        """Take a tick's readings.
-
-        Parameters
-        ----------
-        marker_m : in the plane [m], NaN where nothing was found.
-        minus_gz_radps : mean of the tick's samples, NaN without.
-        """
-        r, offset, innovation = self.model.plant.bellows_radius_m, self.marker_offset_m, np.zeros(3)
-        if not math.isnan(marker_m[0] + marker_m[1]):
-            q = self._exposed()
-            away = np.array(marker_m) - marker_of(q, r, offset)
-            # Ten in a row are no outliers: the estimate itself is off.
-            if float(np.hypot(*away)) <= _GATE_M or self._refused >= 10:
-                innovation[:2] = np.linalg.solve(marker_jacobian(q, r, offset), away)
-                self._refused = 0
-            else:
-                self._refused += 1
-        if not math.isnan(minus_gz_radps):
-            dphi = 0.5 * float(self.y[2] - self.y[3]) / r
-            innovation[2] = minus_gz_radps - dphi - self.bias_radps
-        step = self.gain @ innovation
-        self.y, self.d_N = self.y + step[:6], self.d_N + step[6:8]
-        self.bias_radps += float(step[8])
-        self._past_q = self._past_q + step[:2]
-
-
-def marker_of(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
-    """The marker (2,) [m] of the lengths (2,) [m] (3.6), (A.1)."""
-    head = kinematics.forward(q_m, bellows_radius_m)
-    return kinematics.marker_from_head(head[:2], head[2], offset_m)
-
-
-def marker_jacobian(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
-    """d(x, y) / d(q1, q2), shape (2, 2), of `marker_of`."""
-    phi, J = (
-        float(kinematics.angle(q_m, bellows_radius_m)),
-        kinematics.forward_jacobian(q_m, bellows_radius_m),
-    )
-    return np.asarray(J[:2] + offset_m * np.outer([math.cos(phi), -math.sin(phi)], J[2]))
-
-
-def design_observer(
-    model: Model, latency_s: float = 0.025, marker_offset_m: float = kinematics.MARKER_OFFSET_M
-) -> Observer:
-    """The observer whose gain is the stationary Kalman filter's in the middle of the workspace.
-
-    Raises `BadInputError` where no stationary filter exists.
-    """
-    from scipy.linalg import LinAlgError, expm, solve_discrete_are
-
-    plant, h = model.plant, model.tick_s
-    q = np.full(2, plant.rest_length_m + _AT_M)
-    A = np.zeros((STATES, STATES))
-    A[:6, :6] = dynamics.linearised(plant, q)
-    inverse = np.linalg.inv(dynamics.mass_matrix(plant, q))
-    A[2:4, 6:8] = inverse
-    pushed = np.zeros(STATES)
-    pushed[2:4] = _ACCEL_MPS2_PER_SQRT_HZ**2
-    pushed[6:8] = _FORCE_N_PER_SQRT_S**2
-    pushed[8] = _BIAS_RADPS_PER_SQRT_S**2
-    # Van Loan's block gives transition and noise of a tick together.
-    block = expm(h * np.block([[-A, np.diag(pushed)], [np.zeros_like(A), A.T]]))
-    Phi = block[STATES:, STATES:].T
-    Q = Phi @ block[:STATES, STATES:]
-    r = plant.bellows_radius_m
-    H = np.zeros((3, STATES))
-    H[0, 0] = H[1, 1] = 1.0
-    H[2, 2], H[2, 3], H[2, 8] = 0.5 / r, -0.5 / r, 1.0
-    to_q = np.linalg.inv(marker_jacobian(q, r, marker_offset_m))
-    R = np.zeros((3, 3))
-    R[:2, :2] = _MARKER_M**2 * to_q @ to_q.T
-    R[2, 2] = _GYRO_RADPS**2
-    try:
-        P = solve_discrete_are(Phi.T, H.T, 0.5 * (Q + Q.T), R)
-    except (LinAlgError, ValueError) as error:
-        raise BadInputError(f"observer: has no stationary gain for this plant ({error})") from error
-    L = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-    return Observer(model, np.asarray(L), latency_s, marker_offset_m)
 
 
 # ----------------------------------------------------------------------

@@ -43,6 +43,7 @@ import numpy as np
 from calib.core.arrays import ComplexArray, FloatArray
 from calib.stages.actuator.dynamics import linearised, mass_matrix
 from calib.stages.control import laws
+from calib.stages.control.rig_model import Model, force_of_pwm, holding_force, pwm_of_force
 
 _CUTOFF_HZ = 1.0
 """Of the firmware's usual low-pass."""
@@ -124,18 +125,18 @@ def pid_system(pid: laws.Pid) -> System:
     return System(A[np.ix_(used, used)], B[used], C[:, used], whole, h)
 
 
-def pump_slope(model: laws.Model, q_m: FloatArray) -> FloatArray:
+def pump_slope(model: Model, q_m: FloatArray) -> FloatArray:
     """dg/du (2,) [N/PWM] of the static maps where they hold the lengths (2,); 0 outside their limits."""
-    force = laws.holding_force(model.plant, q_m)
-    pwm = laws.pwm_of_force(model, force)
+    force = holding_force(model.plant, q_m)
+    pwm = pwm_of_force(model, force)
     step = 1.0
     low, high = np.maximum(pwm - step, model.low_pwm), np.minimum(pwm + step, model.high_pwm)
-    slope = (laws.force_of_pwm(model, high) - laws.force_of_pwm(model, low)) / (high - low)
-    held = (force > 1e-9) & (force <= laws.force_of_pwm(model, np.full(2, model.high_pwm)))
+    slope = (force_of_pwm(model, high) - force_of_pwm(model, low)) / (high - low)
+    held = (force > 1e-9) & (force <= force_of_pwm(model, np.full(2, model.high_pwm)))
     return np.asarray(np.where(held, slope, 0.0))
 
 
-def rig_system(model: laws.Model, q_m: FloatArray) -> System:
+def rig_system(model: Model, q_m: FloatArray) -> System:
     """From PWM (2,) to lengths (2,) [m] about the rest at the lengths (2,) [m]."""
     from scipy.linalg import expm
 
@@ -160,7 +161,7 @@ _SLACK = 0.01
 """Of a tick, by which pictures may be later than whole ticks: the time offset is hardly known better."""
 
 
-def firmware_sensing(model: laws.Model) -> System:
+def firmware_sensing(model: Model) -> System:
     """Lengths (2,) as the firmware sees them: their mean late and low-passed, their difference at once."""
     from scipy.signal import butter
 

@@ -11,8 +11,8 @@ import numpy as np
 from calib.core import plot
 from calib.stages.actuator.kinematics import angle, bellows, forward, length
 from calib.stages.control import loops, reach, tuning
-from calib.stages.control.laws import Model, holding_force, largest_force_N
 from calib.stages.control.references import Reference
+from calib.stages.control.rig_model import Model, holding_force, largest_force_N
 from calib.stages.control.section import Controller
 from calib.stages.control.stage import Checked, ControllerEvidence, Runs
 from calib.stages.control.trial import Outcome

@@ -29,6 +29,14 @@ import numpy as np
 from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.control import laws
+from calib.stages.control.rig_model import (
+    Model,
+    bent_rest,
+    falling_rate,
+    holding_force,
+    largest_force_N,
+    static_stiffness,
+)
 
 TOLERANCE_M = 2.5e-4
 """Lengths that may be missing: half of what a pixel of the rig's camera shows."""
@@ -47,35 +55,35 @@ _NEWTON = 6
 _LONGEST_TICKS = 432_000
 
 
-def reachable(model: laws.Model, q_m: FloatArray) -> BoolArray:
+def reachable(model: Model, q_m: FloatArray) -> BoolArray:
     """Whether the pumps can hold the lengths (..., 2) [m], shape (...)."""
-    F, q = laws.holding_force(model.plant, q_m), np.asarray(q_m)
+    F, q = holding_force(model.plant, q_m), np.asarray(q_m)
     slack = 1e-9
-    held = (-slack <= F) & (laws.largest_force_N(model) + slack >= F) & (q > 0.0)
+    held = (-slack <= F) & (largest_force_N(model) + slack >= F) & (q > 0.0)
     return np.asarray(held.all(axis=-1))
 
 
-def longest_m(model: laws.Model) -> float:
+def longest_m(model: Model) -> float:
     """Greatest length [m] at which both bellows can be held alike."""
     from scipy.optimize import brentq
 
-    plant, most = model.plant, float(laws.largest_force_N(model).min())
+    plant, most = model.plant, float(largest_force_N(model).min())
     low, high = plant.rest_length_m, 4.0 * plant.rest_length_m
 
     def over(q: float) -> float:
-        return float(laws.holding_force(plant, np.array([q, q]))[0]) - most
+        return float(holding_force(plant, np.array([q, q]))[0]) - most
 
     return float(brentq(over, low, high)) if over(high) > 0.0 else high
 
 
-def largest_angle(model: laws.Model, pump: int = 0) -> float:
+def largest_angle(model: Model, pump: int = 0) -> float:
     """Greatest angle [rad] that one pump alone can hold, to its side: below zero for the second."""
-    low, high, most = 0.0, 1.5 * math.pi, float(laws.largest_force_N(model)[pump])
+    low, high, most = 0.0, 1.5 * math.pi, float(largest_force_N(model)[pump])
     side = 1.0 if pump == 0 else -1.0
     for _ in range(40):
         middle = 0.5 * (low + high)
         try:
-            held = float(laws.holding_force(model.plant, laws.bent_rest(model, side * middle))[pump]) <= most
+            held = float(holding_force(model.plant, bent_rest(model, side * middle))[pump]) <= most
         except BadInputError:
             held = False
         low, high = (middle, high) if held else (low, middle)
@@ -86,16 +94,16 @@ _ALIKE = 0.01
 """Between the pumps' strengths or lags: less moves a margin by less than rounding gains does (`_slack`)."""
 
 
-def unlike(model: laws.Model) -> bool:
+def unlike(model: Model) -> bool:
     """Whether the pumps differ so much that each side counts by itself."""
     ratios = model.strength[1] / model.strength[0], model.pump.lag_ratio
     return any(abs(math.log(ratio)) > _ALIKE for ratio in ratios)
 
 
-def approach_s(model: laws.Model, q_m: FloatArray) -> float:
+def approach_s(model: Model, q_m: FloatArray) -> float:
     """Time [s] with the pumps at their limit until the forces that hold the lengths (2,) are there."""
-    F = np.maximum(laws.holding_force(model.plant, q_m), 0.0)
-    share = F / laws.largest_force_N(model)
+    F = np.maximum(holding_force(model.plant, q_m), 0.0)
+    share = F / largest_force_N(model)
     if np.any(share >= 1.0):
         return math.inf
     filled_s = -np.array(model.pump.lags_s) * np.log1p(-share)
@@ -133,15 +141,15 @@ class Following:
         return 1e3 * float(np.abs(self.missing_m).max())
 
 
-def _fallen(model: laws.Model, force_N: FloatArray) -> FloatArray:
+def _fallen(model: Model, force_N: FloatArray) -> FloatArray:
     """The least that forces (2,) can be a tick later, by what leaves and by the lag."""
     h, F = model.tick_s, force_N
     lag = F * np.exp(-h / np.array(model.pump.lags_s))
-    return np.maximum(lag, F - h * laws.falling_rate(model, F))
+    return np.maximum(lag, F - h * falling_rate(model, F))
 
 
-def _nearest(model: laws.Model, wanted: FloatArray) -> FloatArray:
-    h, most = model.tick_s, laws.largest_force_N(model)
+def _nearest(model: Model, wanted: FloatArray) -> FloatArray:
+    h, most = model.tick_s, largest_force_N(model)
     a = np.exp(-h / np.array(model.pump.lags_s))
     given = np.empty_like(wanted)
     given[0] = np.clip(wanted[0], 0.0, most)
@@ -152,14 +160,14 @@ def _nearest(model: laws.Model, wanted: FloatArray) -> FloatArray:
 
 
 def _reason(
-    model: laws.Model, q: FloatArray, wanted: FloatArray, given: FloatArray, k: int, missing: FloatArray
+    model: Model, q: FloatArray, wanted: FloatArray, given: FloatArray, k: int, missing: FloatArray
 ) -> str:
     i = int(np.argmax(np.abs(missing[k])))
     jumps = np.abs(np.diff(q[max(k - 1, 0) : k + 3], axis=0))
     if float(jumps.max()) > _JUMP_M:
         j = int(np.argmax(jumps.max(axis=0)))
         return f"the reference of bellows {j + 1} jumps by {1e3 * jumps[:, j].max():.3g} mm within a tick"
-    F, most = float(wanted[k, i]), float(laws.largest_force_N(model)[i])
+    F, most = float(wanted[k, i]), float(largest_force_N(model)[i])
     name = f"bellows {i + 1}"
     if most < F:
         return f"{name} needs {F:.3g} N to be that long, its pump gives at most {most:.3g} N"
@@ -173,14 +181,14 @@ def _reason(
     return f"{name} would have to deflate at {-rate:.3g} N/s, its air leaves at {fastest:.3g} N/s"
 
 
-def follow(model: laws.Model, q_m: FloatArray) -> Following:
+def follow(model: Model, q_m: FloatArray) -> Following:
     """How far the pumps can follow lengths (n, 2) [m] at the ticks, three at least."""
     wanted = laws.wanted_motion(model, q_m).force_N
     given, h = _nearest(model, wanted), model.tick_s
     short = wanted - given
     missing = np.zeros_like(short)
     for k in np.flatnonzero(np.any(short != 0.0, axis=1)):
-        missing[k] = np.linalg.solve(laws.static_stiffness(model.plant, q_m[k]), short[k])
+        missing[k] = np.linalg.solve(static_stiffness(model.plant, q_m[k]), short[k])
     bad = np.flatnonzero(np.max(np.abs(missing), axis=1) > TOLERANCE_M)
     rates = np.diff(wanted, axis=0) / h
     at = int(bad[0]) if len(bad) else None
@@ -197,7 +205,7 @@ def follow(model: laws.Model, q_m: FloatArray) -> Following:
     )
 
 
-def brought_in(model: laws.Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+def brought_in(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     """Lengths (n, 2) [m] with those just outside of the reachable set on its edge, and the longest way there.
 
     The edge is found by Newton's method on the forces that hold them, cut to what the pumps can give. Lengths
@@ -206,11 +214,11 @@ def brought_in(model: laws.Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     q = np.array(q_m, dtype=np.float64)
     moved = 0.0
     for k in np.flatnonzero(~reachable(model, q)):
-        wanted = np.clip(laws.holding_force(model.plant, q[k]), 0.0, laws.largest_force_N(model))
+        wanted = np.clip(holding_force(model.plant, q[k]), 0.0, largest_force_N(model))
         at = q[k].copy()
         for _ in range(_NEWTON):
-            short = wanted - laws.holding_force(model.plant, at)
-            at = at + np.linalg.solve(laws.static_stiffness(model.plant, at), short)
+            short = wanted - holding_force(model.plant, at)
+            at = at + np.linalg.solve(static_stiffness(model.plant, at), short)
             if np.abs(at - q[k]).max() > 2.0 * CLOSE_M:
                 break
         way = float(np.abs(at - q[k]).max())
@@ -230,17 +238,17 @@ def _path(q: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(points), np.concatenate(times)
 
 
-def _least_times(model: laws.Model, points: FloatArray) -> FloatArray:
+def _least_times(model: Model, points: FloatArray) -> FloatArray:
     """Least time (m - 1,) [s] of each piece between the points (m, 2) for forces at rest."""
-    F = np.maximum(laws.holding_force(model.plant, points), 0.0)
-    most = laws.largest_force_N(model)
+    F = np.maximum(holding_force(model.plant, points), 0.0)
+    most = largest_force_N(model)
     dF, middle = np.diff(F, axis=0), 0.5 * (F[1:] + F[:-1])
     up = np.array(model.pump.lags_s) * dF / np.maximum(most - middle, 1e-3 * most)
-    down = -dF / np.maximum(laws.falling_rate(model, middle), 1e-9)
+    down = -dF / np.maximum(falling_rate(model, middle), 1e-9)
     return np.asarray(np.max(np.maximum(up, down), axis=1))
 
 
-def slowed(model: laws.Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     """Lengths (m, 2) [m] at the ticks along the same path, slow enough for the pumps, and how far it moved.
 
     Jumps become the fastest way along the straight line between their ends. Lengths that lie outside of the

@@ -17,7 +17,7 @@ from calib.io.logs import columns_of
 from calib.io.tables import read_cells
 from calib.stages.actuator.kinematics import inverse
 from calib.stages.control import references
-from calib.stages.control.laws import Model
+from calib.stages.control.rig_model import Model
 
 # ----------------------------------------------------------------------
 # References from files: a table of lengths, angles or head positions, or a recorded log.

@@ -10,7 +10,7 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator.kinematics import angle, forward, inverse, marker_from_head
-from calib.stages.control.laws import Model, bent_rest
+from calib.stages.control.rig_model import Model, bent_rest
 
 # ----------------------------------------------------------------------
 # Set-points: constant angle and jump (4.1), polynomial elongation (4.7), ellipse (4.9).

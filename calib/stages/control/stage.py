@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from calib.core.arrays import FloatArray
     from calib.core.rig import Rig
     from calib.core.stage import Progress
-    from calib.stages.control.laws import Model
     from calib.stages.control.reach import Following
     from calib.stages.control.references import Reference
+    from calib.stages.control.rig_model import Model
     from calib.stages.control.section import (
         AntiWindup,
         Controller,
@@ -322,8 +322,8 @@ def _solve_check(model: Model, wanted: Reference) -> Checked:
 
 
 def _check_document(checked: Checked) -> dict[str, Any]:
-    from calib.stages.control.laws import largest_force_N
     from calib.stages.control.reach import largest_angle, longest_m
+    from calib.stages.control.rig_model import largest_force_N
 
     reach = {
         "greatest_angle_rad": largest_angle(checked.model),
@@ -462,7 +462,8 @@ def _solve_tune(
     """
     from calib.core.result import finite_or_none, judged
     from calib.stages.actuator.pump import RateLimit
-    from calib.stages.control.laws import ComputedTorque, design_observer
+    from calib.stages.control.laws import ComputedTorque
+    from calib.stages.control.observer import design_observer
     from calib.stages.control.section import (
         AntiWindup,
         ComputedTorqueGains,
@@ -553,7 +554,7 @@ _MAP_ROWS = 41
 def _static_map(model: Model) -> StaticMap:
     import numpy as np
 
-    from calib.stages.control.laws import largest_force_N, pwm_of_force
+    from calib.stages.control.rig_model import largest_force_N, pwm_of_force
     from calib.stages.control.section import StaticMap
 
     plant = model.plant

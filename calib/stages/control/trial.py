@@ -32,17 +32,15 @@ from calib.stages.control.laws import (
     BackOrientation,
     ComputedTorque,
     FeedForward,
-    Model,
-    Pair,
     Pid,
     computed_torque_step,
-    design_observer,
     feed_forward,
-    feed_forward_pwm,
     wanted_motion,
 )
+from calib.stages.control.observer import design_observer
 from calib.stages.control.reach import largest_angle
 from calib.stages.control.references import Reference, built_in, from_angles
+from calib.stages.control.rig_model import Model, Pair, feed_forward_pwm
 from calib.stages.control.section import Controller
 from calib.stages.control.tracking import Tracking, tracking
 from calib.twin.rig import SimulatedRig, rig_from_file

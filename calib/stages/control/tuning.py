@@ -27,6 +27,7 @@ from calib.core.arrays import ComplexArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.control import laws, loops
 from calib.stages.control.reach import largest_angle, longest_m, reachable, unlike
+from calib.stages.control.rig_model import Model, bent_rest
 from calib.stages.control.section import ControllerCriterion
 
 _INTEGRAL_S = np.concatenate([np.geomspace(0.01, 0.1, 6), np.geomspace(0.15, 4.0, 10)])
@@ -54,17 +55,17 @@ class Tuned:
     points: tuple[Point, ...]
 
 
-def operating_angles(model: laws.Model) -> tuple[tuple[float, float], ...]:
+def operating_angles(model: Model) -> tuple[tuple[float, float], ...]:
     """Rests (q1, q2) [m] at 15, 40, 65 and 90 % of the greatest angle, one pump alone.
 
     To both sides where the pumps are unlike.
     """
     most = [largest_angle(model, pump) for pump in range(1 + unlike(model))]
-    rests = (laws.bent_rest(model, share * one) for one in most for share in (0.15, 0.4, 0.65, 0.9))
+    rests = (bent_rest(model, share * one) for one in most for share in (0.15, 0.4, 0.65, 0.9))
     return tuple((float(q[0]), float(q[1])) for q in rests)
 
 
-def operating_lengths(model: laws.Model) -> tuple[tuple[float, float], ...]:
+def operating_lengths(model: Model) -> tuple[tuple[float, float], ...]:
     """Rests (q1, q2) [m] at 10 to 95 % of the greatest elongation, and two that are bent.
 
     These to both sides where the pumps are unlike.
@@ -77,12 +78,12 @@ def operating_lengths(model: laws.Model) -> tuple[tuple[float, float], ...]:
     return tuple(q for q in found if bool(reachable(model, np.array(q))))
 
 
-def orientation_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> loops.System:
+def orientation_loop(model: Model, pid: laws.Pid, q_m: tuple[float, float]) -> loops.System:
     """Loop of (4.1) about a rest: error of the angle, both controllers, rig, angle."""
     return loops.series(loops.pid_system(pid), _angle_rig(model, q_m))
 
 
-def _angle_rig(model: laws.Model, q_m: tuple[float, float]) -> loops.System:
+def _angle_rig(model: Model, q_m: tuple[float, float]) -> loops.System:
     half, h = 0.5 / model.plant.bellows_radius_m, model.tick_s
     rig = loops.rig_system(model, np.array(q_m))
     return loops.series(
@@ -90,7 +91,7 @@ def _angle_rig(model: laws.Model, q_m: tuple[float, float]) -> loops.System:
     )
 
 
-def position_loop(model: laws.Model, pid: laws.Pid, q_m: tuple[float, float]) -> loops.System:
+def position_loop(model: Model, pid: laws.Pid, q_m: tuple[float, float]) -> loops.System:
     """Loop of (4.5) about a rest: errors of the lengths, both controllers, rig, lengths as seen."""
     return loops.series(both_channels(pid), _position_rig(model, q_m))
 
@@ -100,7 +101,7 @@ def both_channels(pid: laws.Pid) -> loops.System:
     return loops.side_by_side(loops.pid_system(pid), loops.pid_system(pid))
 
 
-def _position_rig(model: laws.Model, q_m: tuple[float, float]) -> loops.System:
+def _position_rig(model: Model, q_m: tuple[float, float]) -> loops.System:
     return loops.series(loops.rig_system(model, np.array(q_m)), loops.firmware_sensing(model))
 
 
@@ -165,7 +166,7 @@ def _two_digits(value: float) -> float:
 
 
 def _search(
-    model: laws.Model,
+    model: Model,
     criterion: ControllerCriterion,
     at: Sequence[tuple[float, float]],
     rigs: Sequence[loops.System],
@@ -223,7 +224,7 @@ def _slack(criterion: ControllerCriterion) -> ControllerCriterion:
     )
 
 
-def tune_orientation(model: laws.Model, criterion: ControllerCriterion) -> Tuned:
+def tune_orientation(model: Model, criterion: ControllerCriterion) -> Tuned:
     """PID of the angle with the largest Ki [PWM/rad/s].
 
     Raises `BadInputError` where no gains hold the margins.
@@ -235,7 +236,7 @@ def tune_orientation(model: laws.Model, criterion: ControllerCriterion) -> Tuned
     )
 
 
-def tune_position(model: laws.Model, criterion: ControllerCriterion) -> Tuned:
+def tune_position(model: Model, criterion: ControllerCriterion) -> Tuned:
     """PD of the lengths with the largest Kp [PWM/m], the firmware's filters in the loop.
 
     Raises `BadInputError` where no gains hold the margins.

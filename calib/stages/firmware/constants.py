@@ -22,7 +22,8 @@ from calib.stages.actuator.kinematics import MARKER_OFFSET_M, inverse_coefficien
 from calib.stages.actuator.parameters import LONGEST_ELONGATION_M, Plant
 from calib.stages.actuator.pump import PWM_MAX, ElongationForce
 from calib.stages.camera.pose import homography_with_lens, plane_pixels
-from calib.stages.control.laws import ANGLE_PIDS, LENGTHS_PD, PWM_MIN, FeedForward, Pid
+from calib.stages.control.laws import ANGLE_PIDS, LENGTHS_PD, FeedForward, Pid
+from calib.stages.control.rig_model import PWM_MIN
 from calib.stages.control.section import OrientationGains, StaticMap
 from calib.stages.estimator import constant_gain
 from calib.stages.estimator.constant_gain import MOST_DELAY_TICKS, SHAKING_RADPS2, TickNoise
