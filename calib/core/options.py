@@ -46,7 +46,7 @@ class LogOptions:
     ----------
     acc_unit, gyro_unit : units of `calib.io.columns.UNITS`, None for what names, files or readings say.
     columns : a columns.yaml, None for the one beside the log.
-    topics : what is where in a bag, see `calib.io.bags`.
+    topics : what is where in a bag, see `calib.io.bag_topics`.
     """
 
     acc_unit: AccUnit | None = option(None, "Unit of ax, ay, az in the logs, else as names or readings say.")

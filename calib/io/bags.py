@@ -2,313 +2,25 @@
 
 from __future__ import annotations
 
-import bz2
-import importlib
-import io
 import json
 import math
-import operator
-import os
-import re
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
-from pathlib import Path, PurePath
-from typing import Any, BinaryIO, Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
 from calib.core.arrays import FloatArray, IntArray
 from calib.core.errors import BadInputError, CalibError, package, pip_install
-from calib.core.files import check_readable, one_line, quoted, read_yaml_mapping, shown, to_be
+from calib.core.files import check_readable, one_line, shown, to_be
 from calib.core.words import several
-from calib.io.columns import COLUMNS
+from calib.io import unpacking
+from calib.io.bag_topics import Topic, TopicMap, reader_of, topic_map
 from calib.io.tables import Block, Passed
-
-# ----------------------------------------------------------------------
-# Which field of which topic of a bag is which column of a log.
-#
-# A bag holds messages by topic; `calib.io.logs` knows columns. What goes where stands in a YAML file,
-# `NAME.topics.yaml` beside the bag, or `topics.yaml` in its folder:
-#
-#     time: stamp                # header.stamp where a message has one (default), or received
-#     topics:
-#       /imu/data: imu           # accelerations and rates of sensor_msgs/Imu
-#       /camera/marker:          # any message: column and path of the field
-#         u_px: point.x
-#         v_px: point.y
-#       /command:
-#         pwm1: data[0]
-#         gz_radps: {field: rates.z, factor: 0.017453292519943295}
-#
-# Without `topics` the only topic of sensor_msgs/Imu is the IMU, `marker` (a point) the marker and `pwm` (an
-# array) the commands, in whatever namespace; fields of JSON messages that bear a column's name are that
-# column. Topics without messages are passed over.
-
-IMU = {
-    "ax_mps2": "linear_acceleration.x",
-    "ay_mps2": "linear_acceleration.y",
-    "az_mps2": "linear_acceleration.z",
-    "gx_radps": "angular_velocity.x",
-    "gy_radps": "angular_velocity.y",
-    "gz_radps": "angular_velocity.z",
-}
-"""Fields of sensor_msgs/Imu."""
-
-_POINTS = {
-    "geometry_msgs/PointStamped": "point.",
-    "geometry_msgs/Point": "",
-    "geometry_msgs/Vector3Stamped": "vector.",
-    "geometry_msgs/Vector3": "",
-}
-_ARRAY = re.compile(r"std_msgs/(Float|U?Int)(8|16|32|64)MultiArray")
-_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d{1,6}\])*)")
-_PRESETS = ("imu", "marker", "pwm")
-_SHOWN = 8
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag: its name, its type as package/Name, the fields of its JSON schema, whether it has any
-    messages."""
-
-    name: str
-    kind: str
-    fields: tuple[str, ...] = ()
-    used: bool = True
-
-
-def in_use(topics: Sequence[Topic]) -> Sequence[Topic]:
-    """Those that have messages; all where none has."""
-    return [topic for topic in topics if topic.used] or topics
-
-
-@dataclass(frozen=True)
-class Field:
-    """Where a column comes from: path of the field, and what it is multiplied by."""
-
-    column: str
-    path: str
-    factor: float = 1.0
-
-
-@dataclass(frozen=True)
-class TopicMap:
-    """Fields by topic; `stamped` whether the time is the message's own, `source` for messages."""
-
-    source: str
-    topics: Mapping[str, tuple[Field, ...]]
-    stamped: bool = True
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Columns that come out, in the order of `calib.io.logs.COLUMNS`."""
-        named = {field.column for fields in self.topics.values() for field in fields}
-        return tuple(name for name in COLUMNS if name in named)
-
-
-def find_topics(path: Path) -> Path | None:
-    """The file of topics that lies beside a bag, or in it if it is a folder; None without."""
-    places = [path.with_name(f"{path.stem}.topics.yaml"), path.with_name("topics.yaml")]
-    if path.is_dir():
-        places = [path / "topics.yaml", path.with_name(f"{path.name}.topics.yaml"), places[1]]
-    return next((place for place in places if place.is_file()), None)
-
-
-def topic_map(bag: Path, topics: Sequence[Topic], given: Path | None = None) -> TopicMap:
-    """What is read of a bag: as `given` says, as the file beside it says, or the defaults.
-
-    Raises `BadInputError` naming the key for what is wrong, the topics of the bag for one it lacks.
-    """
-    place = find_topics(bag) if given is None else given
-    return _defaults(bag, topics) if place is None else _from_file(place, bag, topics)
-
-
-def _listed(topics: Sequence[Topic]) -> str:
-    named = [f"{one_line(topic.name)[:80]} ({one_line(topic.kind)[:60]})" for topic in topics]
-    return several(named, _SHOWN) or "none"
-
-
-def _preset(kind: str, topic: Topic) -> dict[str, str] | None:
-    """Columns and paths of what is expected of a topic, None where its type has none."""
-    if kind == "imu":
-        return dict(IMU) if topic.kind == "sensor_msgs/Imu" else None
-    if kind == "marker" and topic.kind in _POINTS:
-        return {"u_px": _POINTS[topic.kind] + "x", "v_px": _POINTS[topic.kind] + "y"}
-    if kind == "pwm" and _ARRAY.fullmatch(topic.kind):
-        return {"pwm1": "data[0]", "pwm2": "data[1]"}
-    return None
-
-
-_EXPECTED = {
-    "imu": "sensor_msgs/Imu",
-    "marker": "geometry_msgs/PointStamped, Point, Vector3Stamped or Vector3",
-    "pwm": "std_msgs/Float32MultiArray or another array of numbers",
-}
-
-
-def _fields(columns: Mapping[str, str]) -> tuple[Field, ...]:
-    return tuple(Field(column, path) for column, path in columns.items())
-
-
-def _defaults(bag: Path, topics: Sequence[Topic]) -> TopicMap:
-    source = shown(bag)
-    found: dict[str, tuple[Field, ...]] = {}
-    topics = in_use(topics)
-    imus = [topic for topic in topics if topic.kind == "sensor_msgs/Imu"]
-    hint = f"say which in {shown(bag.stem)}.topics.yaml beside it"
-    if len(imus) > 1:
-        raise BadInputError(f"{source}: has {len(imus)} topics of sensor_msgs/Imu: {_listed(imus)}; {hint}")
-    for topic in topics:
-        named = topic.name.rsplit("/", 1)[-1]
-        kind = "imu" if topic in imus else named if named in ("marker", "pwm") else ""
-        columns = _preset(kind, topic) if kind else None
-        if columns is None:
-            columns = {name: name for name in topic.fields if name in COLUMNS}
-        if columns:
-            found[topic.name] = _fields(columns)
-    if not found:
-        from calib.io.states import HEAD, STATES_TOPIC
-
-        if {STATES_TOPIC, HEAD} <= {topic.name for topic in topics}:
-            raise BadInputError(f"{source}: holds states that calib replay has written, expected a log")
-        raise BadInputError(
-            f"{source}: has no topic that is known by itself, found {_listed(topics)}; {hint}"
-        )
-    return _checked(TopicMap(source, found))
-
-
-def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
-    source, document = shown(place), read_yaml_mapping(place)
-    for key in document:
-        if key not in ("time", "topics"):
-            raise BadInputError(f"{source}: {one_line(key)[:60]} is not known, expected time or topics")
-    time = document.get("time", "stamp")
-    if time not in ("stamp", "received"):
-        raise BadInputError(f"{source}: time is {quoted(time)}, expected stamp or received")
-    if "topics" not in document:
-        return replace(_defaults(bag, topics), stamped=time == "stamp")
-    listed = document["topics"]
-    if not isinstance(listed, dict) or not listed:
-        raise BadInputError(f"{source}: topics is {quoted(listed)}, expected topics with their columns")
-    there = {topic.name: topic for topic in topics}
-    found = {}
-    for name, wanted in listed.items():
-        if name not in there:
-            raise BadInputError(
-                f"{source}: the topic {quoted(name)} is not in {shown(bag)}, which has {_listed(topics)}"
-            )
-        found[name] = _wanted(f"{source}: topics.{one_line(name)[:80]}", wanted, there[name])
-    return _checked(TopicMap(source, found, time == "stamp"))
-
-
-def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
-    """The fields that one entry of the file asks for."""
-    known = wanted in _PRESETS if isinstance(wanted, str) else isinstance(wanted, dict) and wanted
-    if not known:
-        raise BadInputError(f"{where} is {quoted(wanted)}, expected {', '.join(_PRESETS)} or columns")
-    if isinstance(wanted, str):
-        columns = _preset(wanted, topic)
-        if columns is None:
-            raise BadInputError(
-                f"{where} is of type {one_line(topic.kind)[:60]}, expected {_EXPECTED[wanted]}"
-            )
-        return _fields(columns)
-    fields = []
-    for column, path in wanted.items():
-        if column not in COLUMNS:
-            raise BadInputError(
-                f"{where}: {quoted(column)} is no column, expected one of {', '.join(COLUMNS)}"
-            )
-        entry: dict[str, Any] = (
-            path if isinstance(path, dict) and set(path) <= {"field", "factor"} else {"field": path}
-        )
-        path, factor = entry.get("field"), entry.get("factor", 1.0)
-        if not isinstance(path, str) or not all(_STEP.fullmatch(step) for step in path.split(".")):
-            raise BadInputError(
-                f"{where}.{column} is {quoted(path)}, expected a field such as point.x or data[0]"
-            )
-        if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor):
-            raise BadInputError(f"{where}.{column}: the factor is {quoted(factor)}, expected a number")
-        fields.append(Field(column, path, float(factor)))
-    return tuple(fields)
-
-
-def _checked(found: TopicMap) -> TopicMap:
-    """The map, if no column comes from two topics."""
-    origin: dict[str, str] = {}
-    for topic, fields in found.topics.items():
-        for field in fields:
-            if field.column in origin:
-                names = f"{one_line(origin[field.column])[:80]} and {one_line(topic)[:80]}"
-                raise BadInputError(f"{found.source}: {field.column} comes from two topics, {names}")
-            origin[field.column] = topic
-    return found
-
-
-def reader_of(source: str, topic: str, field: Field) -> Callable[[Any], float]:
-    """A function from a message to a column's value; NaN for a null.
-
-    The function raises `BadInputError` where the message has no such field or it is no number.
-    """
-    steps: list[str | int] = [
-        name if name else int(index) for name, index in re.findall(r"([A-Za-z_]\w*)|\[(\d+)\]", field.path)
-    ]
-    where = f"{source}: {one_line(topic)[:80]}: {field.path} (for {field.column})"
-    factor = field.factor
-
-    def found(message: Any) -> Any:
-        value = message
-        for step in steps:
-            if isinstance(step, int) and isinstance(value, Sequence) and not value:
-                # Nothing was detected.
-                return None
-            try:
-                value = (
-                    value[step] if isinstance(step, int) or isinstance(value, dict) else getattr(value, step)
-                )
-            except (AttributeError, KeyError, IndexError, TypeError):
-                raise BadInputError(
-                    f"{where} is not in the message, which has {_named(value, step)}"
-                ) from None
-        return value
-
-    named = [step for step in steps if isinstance(step, str)]
-    quick = operator.attrgetter(field.path) if len(named) == len(steps) else found
-
-    def read(message: Any) -> float:
-        try:
-            value = found(message) if isinstance(message, dict) else quick(message)
-        except AttributeError:
-            value = found(message)
-        if isinstance(value, float):
-            return value * factor
-        if value is None:
-            return math.nan
-        try:
-            if isinstance(value, str | bytes | bytearray):
-                raise TypeError
-            return float(value) * factor
-        except (TypeError, ValueError, OverflowError):
-            raise BadInputError(f"{where} is {quoted(value)}, expected a number") from None
-
-    return read
-
-
-def _named(value: Any, step: str | int) -> str:
-    """What stands where a field was looked for in vain."""
-    if isinstance(step, int):
-        try:
-            return f"{len(value)} elements there"
-        except TypeError:
-            return f"{quoted(value)} there"
-    names = list(value) if isinstance(value, dict) else list(getattr(value, "__dataclass_fields__", ()))
-    names = [one_line(str(name))[:40] for name in names if not str(name).startswith("__")]
-    return ", ".join(names[:_SHOWN]) if names else f"{quoted(value)} there"
-
 
 # ----------------------------------------------------------------------
 # From the messages of a bag to the rows of a log, in the order of their time.
@@ -503,173 +215,6 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
 
 
 # ----------------------------------------------------------------------
-# Packed parts of bags, unpacked within a bound: a kilobyte may stand for gigabytes.
-#
-# The packages that read bags unpack what they find, however much that becomes. So an MCAP file's chunks
-# are looked at before it is read, chunks and messages of ROS bags are unpacked here, and a bag that is packed
-# as a whole, which is unpacked on the disk, may not grow more than logs do.
-
-MOST_BYTES = 1 << 28
-"""Of one record, chunk or message, packed or not."""
-
-_MOST_GROWTH = 200
-_NAME_NODE, _ARRAY_NODE, _SEQUENCE_NODE = 2, 3, 4
-"""Kinds of nodes in a field's type."""
-_PIECE = 1 << 20
-
-
-class BoundedFile(io.BufferedReader):
-    """A file that makes no room for more bytes than it has, whatever it says of the length of a part."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path))
-        self._size = os.fstat(self.fileno()).st_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """As the base class."""
-        if size is not None and size > _PIECE:
-            size = min(size, max(0, self._size - self.tell()))
-        return super().read(size)
-
-
-class BoundedPath(type(Path())):  # type: ignore[misc]  # a Path is made as one of two classes
-    """A path whose files are `BoundedFile`, for readers that open them by themselves."""
-
-    def open(self, mode: str = "r", *others: Any, **more: Any) -> Any:
-        """As the base class."""
-        return BoundedFile(self) if mode == "rb" else super().open(mode, *others, **more)
-
-
-def _zstd() -> Any:
-    """The package that `rosbags` uses: Python's own from 3.14 on."""
-    try:
-        return importlib.import_module("compression.zstd")
-    except ImportError:
-        return importlib.import_module("backports.zstd")
-
-
-def _decompressor(packing: str) -> Any:
-    if packing == "bz2":
-        return bz2.BZ2Decompressor()
-    if packing == "lz4":
-        return importlib.import_module("lz4.frame").LZ4FrameDecompressor()
-    return _zstd().ZstdDecompressor()
-
-
-def unpacked(packing: str, data: bytes) -> bytes:
-    """What is packed as "bz2", "lz4" or "zstd". Raises `ValueError` for more than `MOST_BYTES`."""
-    out = _at_most(packing, data)
-    if len(out) > MOST_BYTES:
-        raise ValueError(f"a part of it unpacks to more than {MOST_BYTES / 1e6:.0f} MB")
-    return out
-
-
-def bound_chunks(reader: Any) -> None:
-    """Let an opened reader of ROS 1 bags unpack its chunks by `unpacked`."""
-    kinds = {id(bz2.decompress): "bz2", id(importlib.import_module("lz4.frame").decompress): "lz4"}
-    for place, chunk in reader.chunks.items():
-        if chunk.datasize > MOST_BYTES:
-            raise ValueError(f"a chunk has {chunk.datasize / 1e6:.0f} MB")
-        packing = kinds.get(id(chunk.decompressor))
-        if packing is not None:
-            reader.chunks[place] = chunk._replace(decompressor=partial(unpacked, packing))
-
-
-def check_types(kinds: Mapping[str, Any]) -> None:
-    """Raise `ValueError` for message types of which no bytes at all may stand for endless elements.
-
-    Parameters
-    ----------
-    kinds : constants and fields by the type's name, as `rosbags` has them; a field is its name and a node.
-    """
-    known: dict[str, bool] = {}
-
-    def empty(node: Any) -> bool:
-        kind, inner = int(node[0]), node[1]
-        if kind == _NAME_NODE:
-            return nothing(inner)
-        if kind in (_ARRAY_NODE, _SEQUENCE_NODE) and empty(inner[0]):
-            raise ValueError("a type of its messages has many elements that hold nothing")
-        return False
-
-    def nothing(name: str) -> bool:
-        if name not in known:
-            known[name] = False
-            # No field is passed over: each may be what is looked for.
-            found = [empty(node) for _, node in kinds[name][1]] if name in kinds else [False]
-            known[name] = all(found)
-        return known[name]
-
-    for name in kinds:
-        nothing(name)
-
-
-def check_mcap(path: Path, stream: BinaryIO) -> None:
-    """Refuse a chunk that unpacks to more than there is room for, whatever it says of itself."""
-    errors = importlib.import_module("mcap.exceptions")
-    records = importlib.import_module("mcap.stream_reader").StreamReader(
-        stream, emit_chunks=True, record_size_limit=MOST_BYTES
-    )
-    try:
-        for record in records.records:
-            if type(record).__name__ == "Chunk" and (size := _unpacked_size(record)) > MOST_BYTES:
-                raise BadInputError(
-                    f"{shown(path)}: a chunk unpacks to {size / 1e6:.0f} MB or more, expected at most "
-                    f"{MOST_BYTES / 1e6:.0f}"
-                )
-    except (errors.EndOfFile, struct.error):
-        # How much of a file that ends early can be used is seen when it is read.
-        pass
-    stream.seek(0)
-
-
-def _unpacked_size(chunk: Any) -> int:
-    """Bytes that a chunk unpacks to, at least, where that is beyond what is allowed."""
-    size = int(chunk.uncompressed_size)
-    if chunk.compression == "zstd":
-        told = int(importlib.import_module("zstandard").frame_content_size(chunk.data))
-        return max(size, told if told >= 0 else len(_at_most("zstd", chunk.data)))
-    if chunk.compression == "lz4" and 255 * len(chunk.data) > MOST_BYTES:
-        return max(size, len(_at_most("lz4", chunk.data)))
-    return size
-
-
-def _at_most(packing: str, data: bytes) -> bytes:
-    found: bytes = _decompressor(packing).decompress(data, MOST_BYTES + 1)
-    return found
-
-
-def check_folder_of_bag(path: Path) -> str:
-    """How the messages of a ROS 2 bag's folder are packed: "zstd", or "" where they are not.
-
-    Raises `BadInputError` where its metadata are no YAML, or a file of it unpacks to too much.
-    """
-    told = read_yaml_mapping(path / "metadata.yaml").get("rosbag2_bagfile_information")
-    if not isinstance(told, dict):
-        raise BadInputError(f"{shown(path)}: has a metadata.yaml without rosbag2_bagfile_information")
-    mode, listed = str(told.get("compression_mode") or "").lower(), told.get("relative_file_paths")
-    files = [path / PurePath(str(name)).name for name in listed] if isinstance(listed, list) else []
-    for file in files:
-        if not file.is_file():
-            raise BadInputError(f"{shown(file)}: is not there, expected a file of the bag")
-        if mode == "file":
-            _check_growth(file)
-        elif told.get("storage_identifier") == "mcap":
-            with BoundedFile(file) as stream:
-                check_mcap(file, stream)
-    return "zstd" if mode == "message" else ""
-
-
-def _check_growth(file: Path) -> None:
-    most, size = max(MOST_BYTES, _MOST_GROWTH * file.stat().st_size), 0
-    with file.open("rb") as packed, _zstd().open(packed, "rb") as stream:
-        while piece := stream.read(_PIECE):
-            size += len(piece)
-            if size > most:
-                raise BadInputError(f"{shown(file)}: unpacks to more than {most / 1e6:.0f} MB")
-
-
-# ----------------------------------------------------------------------
 # Logs in bags: ROS 1 `.bag`, ROS 2 folders and `.db3`, MCAP (ROS messages or JSON).
 #
 # The readers are those of the packages `rosbags` and `mcap` (extra logs). Both hand out one message at a
@@ -750,7 +295,7 @@ class _RosBag:
         for connection, received, data in self._reader.messages(connections=connections):
             # The file of a bag without its folder does not say that its messages are packed.
             if self._packing or (self._reader.is2 and data[:4] == _ZSTD_FRAME):
-                data = unpacked("zstd", data)
+                data = unpacking.unpacked("zstd", data)
             yield connection.topic, received, self._reader.deserialize(data, connection.msgtype)
 
 
@@ -764,12 +309,12 @@ def _rosbag(path: Path) -> Iterator[Source]:
     typesys = _module(path, "rosbags.typesys")
     # Bags older than ROS 2 Iron do not say how their messages are made up.
     known = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    packing = check_folder_of_bag(path) if path.is_dir() else ""
-    with reader.AnyReader([BoundedPath(path)], default_typestore=known) as opened:
-        check_types(opened.typestore.fielddefs)
+    packing = unpacking.check_folder_of_bag(path) if path.is_dir() else ""
+    with reader.AnyReader([unpacking.BoundedPath(path)], default_typestore=known) as opened:
+        unpacking.check_types(opened.typestore.fielddefs)
         for one in opened.readers:
             if hasattr(one, "chunks"):
-                bound_chunks(one)
+                unpacking.bound_chunks(one)
             elif packing:
                 # Its own way to unpack messages has no bound.
                 one.storage.metadata = one.storage.metadata._replace(compression_mode=None)
@@ -785,10 +330,10 @@ class _Mcap:
         reader = _module(path, "mcap.reader")
         self._errors = _module(path, "mcap.exceptions")
         self._make = {
-            True: lambda: reader.SeekingReader(stream, record_size_limit=MOST_BYTES),
-            False: lambda: reader.NonSeekingReader(stream, record_size_limit=MOST_BYTES),
+            True: lambda: reader.SeekingReader(stream, record_size_limit=unpacking.MOST_BYTES),
+            False: lambda: reader.NonSeekingReader(stream, record_size_limit=unpacking.MOST_BYTES),
         }
-        check_mcap(path, stream)
+        unpacking.check_mcap(path, stream)
         summary = self._summary()
         self._indexed = summary is not None
         # Sorting costs a third of the time, and most writers close a chunk before they begin the next.
@@ -872,7 +417,7 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
             store.register(typesys.get_types_from_idl(part))
     else:
         store.register(typesys.get_types_from_msg(text, name))
-    check_types(store.fielddefs)
+    unpacking.check_types(store.fielddefs)
     read = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
     return lambda data: read(data, name)
 
@@ -880,5 +425,5 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
 @contextmanager
 def _mcap(path: Path) -> Iterator[Source]:
     _module(path, "mcap.reader")
-    with BoundedFile(path) as stream:
+    with unpacking.BoundedFile(path) as stream:
         yield _Mcap(path, stream)

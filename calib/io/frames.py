@@ -292,7 +292,8 @@ _GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 
 
 def _of_bag(path: Path, topic: str | None) -> Iterator[GrayImage]:
-    from calib.io.bags import in_use, opened_bag
+    from calib.io.bag_topics import in_use
+    from calib.io.bags import opened_bag
 
     with opened_bag(path) as stream:
         pictures = [one for one in stream.topics if one.kind in (_IMAGE, _COMPRESSED)]

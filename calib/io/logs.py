@@ -410,7 +410,7 @@ def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, .
 
 def beside(path: Path) -> list[Path]:
     """Files beside a log that say what is in it: which topic of a bag is which column, and columns.yaml."""
-    from calib.io.bags import find_topics
+    from calib.io.bag_topics import find_topics
 
     found = [find_topics(path) if is_bag(path) else None, find_columns(path)]
     return [one for one in found if one is not None]

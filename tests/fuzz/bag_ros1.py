@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fuzz.bagbytes import check_bag, damage
 
-MODULES = ("calib.io.bags",)
+MODULES = ("calib.io.bags", "calib.io.bag_topics", "calib.io.unpacking")
 
 mutate = damage
 

@@ -10,7 +10,7 @@ from unittest import mock
 
 from fuzz.bagbytes import check_bag, damage
 
-MODULES = ("calib.io.bags",)
+MODULES = ("calib.io.bags", "calib.io.bag_topics", "calib.io.unpacking")
 
 MOST_BYTES = 40_000
 

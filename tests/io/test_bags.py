@@ -18,19 +18,11 @@ from hypothesis import strategies as st
 
 from calib.core.errors import BadInputError
 from calib.core.options import LogOptions
-from calib.io import bags as log_unpacking
-from calib.io.bags import (
-    WINDOW_S,
-    BoundedFile,
-    BoundedPath,
-    Field,
-    Topic,
-    TopicMap,
-    reader_of,
-    rows_from_messages,
-    topic_map,
-)
+from calib.io import unpacking
+from calib.io.bag_topics import Field, Topic, TopicMap, reader_of, topic_map
+from calib.io.bags import WINDOW_S, rows_from_messages
 from calib.io.logs import iter_log, read_log
+from calib.io.unpacking import BoundedFile, BoundedPath
 
 COLUMNS = {
     "imu": ("ax_mps2", "ay_mps2", "az_mps2", "gx_radps", "gy_radps", "gz_radps"),
@@ -214,7 +206,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     (tmp_path / "topics.yaml").write_text("topics:\n  /imu: {gz_radps: gz_radps}\n")
     if index:
         assert len(read_log(path)) == 2000
-    monkeypatch.setattr("calib.io.bags.MOST_BYTES", 100_000)
+    monkeypatch.setattr("calib.io.unpacking.MOST_BYTES", 100_000)
     said = _refused(path)
     assert "a chunk unpacks to" in said or "exceeds" in said
 
@@ -399,7 +391,7 @@ MOST = 100_000
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_unpacking, "MOST_BYTES", MOST)
+    monkeypatch.setattr(unpacking, "MOST_BYTES", MOST)
 
 
 def _ros1(path: Path, packing: str, count: int) -> Path:
@@ -447,8 +439,8 @@ def test_ros_2_bags_that_are_packed(mode: str, tmp_path: Path, monkeypatch: pyte
     if mode == "MESSAGE":
         alone = read_log(next((tmp_path / "log").glob("*.db3")))
         assert np.array_equal(alone.columns["v_px"], log.columns["v_px"])
-    monkeypatch.setattr(log_unpacking, "MOST_BYTES", MOST)
-    monkeypatch.setattr(log_unpacking, "_MOST_GROWTH", 3)
+    monkeypatch.setattr(unpacking, "MOST_BYTES", MOST)
+    monkeypatch.setattr(unpacking, "_MOST_GROWTH", 3)
     with pytest.raises(BadInputError, match="unpacks to more than"):
         read_log(_ros2(tmp_path / "big", mode, 2 * MOST))
 

@@ -88,7 +88,7 @@ class Ellipse:
 # References at the controller's ticks: the set-points of chapter 4, and series of lengths or angles.
 #
 # A reference always has both lengths and angle. One that was given as an angle alone gets the lengths at
-# which one pump bends the actuator to it and the other idles (`laws.bent_rest`).
+# which one pump bends the actuator to it and the other idles (`rig_model.bent_rest`).
 
 BUILT_IN = ("elongation", "step", "jump", "ellipse")
 """(4.7) held after 5 s, 0.7 rad from rest, 0.7 then 0.3 rad at 5 s, (4.9)."""
