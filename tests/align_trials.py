@@ -15,7 +15,7 @@ from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficie
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import Imu, Tracker
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 __all__ = ["MOTIONS", "PRIOR", "Trial", "align_log", "draw", "known", "prior_settings", "scores", "twin_log"]
 
@@ -85,7 +85,7 @@ def twin_log(
 ) -> Log:
     """A log of the rig."""
     run = run_scenario(make_scenario(scenario, options), rig, seed, "truth", duration_s)
-    return log_of(run, f"{scenario}{seed}")
+    return run_log(run, f"{scenario}{seed}")
 
 
 def align_log(log: Log) -> AlignLog:

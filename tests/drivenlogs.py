@@ -18,7 +18,7 @@ from calib.stages.estimator.kinematic import Rows, Setup
 from calib.stages.estimator.sensors import SIZE, accelerometer, marker, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 
 def varied_drive(seed: int, share: float = 0.08) -> SimulatedRig:
@@ -55,7 +55,7 @@ def driven_log(name: str, seed: int = 0, orifice: bool = False) -> tuple[Simulat
     if orifice:
         rig = replace(rig, pump=replace(rig.pump, deflation=Orifice()))
     kind, duration = SCENARIOS[name]
-    return rig, log_of(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
+    return rig, run_log(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
 
 
 def estimated(setup: Setup, drive: Drive, log: Log) -> tuple[dict[str, FloatArray], FloatArray]:

@@ -17,7 +17,7 @@ from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import Tracker, Trajectory
-from calib.twin.simulate import _NODES_PER_TICK, Run, Sensors, _Plant, log_of
+from calib.twin.simulate import _NODES_PER_TICK, Run, Sensors, _Plant, run_log
 
 SCENARIOS = {
     "static": ("static", 15.0),
@@ -97,7 +97,7 @@ def simulated(name: str, seed: int = 0) -> tuple[SimulatedRig, Log]:
     """A rig and its log of a scenario."""
     rig = varied(seed)
     kind, duration = SCENARIOS[name]
-    return rig, log_of(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
+    return rig, run_log(run_scenario(make_scenario(kind), rig, seed, "sensors", duration))
 
 
 def rows_from(log: Log) -> Rows:
@@ -185,5 +185,5 @@ def pushed_log(seed: int, seconds: float = 15.0) -> Log:
     whole, sensors = Trajectory(node_s, nodes), Sensors(rig, _Plant(rig, rig.plant), ticks, seed)
     sensors.take_frames(whole, slice(0, ticks))
     sensors.take_samples(whole, slice(0, len(sensors.imu.taken_s)))
-    log = log_of(Run(rig, rig.plant, whole, np.zeros((ticks, 2)), rig.pump.tick_s, None, sensors))
+    log = run_log(Run(rig, rig.plant, whole, np.zeros((ticks, 2)), rig.pump.tick_s, None, sensors))
     return replace(log, columns={name: of for name, of in log.columns.items() if not name.startswith("pwm")})

@@ -19,7 +19,7 @@ import pytest
 from firmware_rigs import header
 
 from calib.io.serial import Inputs
-from calib.stages.firmware.conformance import binary32, reference_of
+from calib.stages.firmware.conformance import binary32, make_reference
 from calib.stages.firmware.header import VERBATIM, Header, verbatim
 from calib.stages.firmware.vectors import TOLERANCE
 
@@ -320,7 +320,7 @@ def compare(
     What the fused estimator may have decided otherwise lies within a micrometre of its limits.
     """
     constants = header.values
-    reference = reference_of(constants, undistort, fused, mean_rate)
+    reference = make_reference(constants, undistort, fused, mean_rate)
     wanted, undecided = [], 0.0
     for k, given in enumerate(ticks):
         out = reference.step(given, int(found.flags[k]))

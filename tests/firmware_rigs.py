@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.core.rig import Rig
 from calib.stages.estimator.constant_gain import TickNoise, design
-from calib.stages.firmware.header import Header, header_of
+from calib.stages.firmware.header import Header, make_header
 from calib.stages.lowpass.filters import Design, design_lowpass
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
@@ -194,4 +194,4 @@ def rig(kind: str = "nominal") -> Rig:
 @cache
 def header(kind: str = "nominal") -> Header:
     """The header of that rig."""
-    return header_of(rig(kind), "rig.yaml")
+    return make_header(rig(kind), "rig.yaml")

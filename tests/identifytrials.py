@@ -21,7 +21,7 @@ from calib.stages.actuator.pump import RateLimit
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 SIGMA = (0.004, 0.0003)
 """Noise of angle [rad] and length [m] in tracks from the integrator."""
@@ -127,7 +127,7 @@ def rig_file(path: Path, **sections: Any) -> Rig:
 def log_file(path: Path, rig: SimulatedRig, kind: str, seed: int, duration_s: float, **settings: str) -> Path:
     """A simulated log with the sensors' noise."""
     run = run_scenario(make_scenario(kind, settings), rig, seed, "sensors", duration_s)
-    write_log(path, log_of(run))
+    write_log(path, run_log(run))
     return path
 
 

@@ -36,12 +36,12 @@ def convert(
     import numpy as np
 
     from calib.io.columns import COLUMNS_FILE
-    from calib.io.logs import LOG, beside, iter_log, refuse_counts, within
+    from calib.io.logs import LOG, blank_impossible, companion_files, iter_log, refuse_counts
     from calib.io.states import states_writer
     from calib.io.tables import Passed
 
     check_log_name(output)
-    note_inputs([log, *beside(log), *stated.files])
+    note_inputs([log, *companion_files(log), *stated.files])
     check_writable(output, LOG)
     if save_columns is not None:
         check_writable(save_columns, COLUMNS_FILE)
@@ -67,7 +67,11 @@ def convert(
     ):
         for block in chain([first], stream):
             add(np.column_stack([block.t_s, *(block.columns[name] for name in names)]))
-            rows, passed, beyond = rows + len(block), passed + block.passed, beyond + within(block).passed
+            rows, passed, beyond = (
+                rows + len(block),
+                passed + block.passed,
+                beyond + blank_impossible(block).passed,
+            )
             again = np.flatnonzero(np.diff(block.t_s, prepend=before) < 0.0)
             if len(again) and not back:
                 k = again[0]

@@ -42,7 +42,7 @@ def join(
     those of a phone that writes a file for each of its sensors.
     """
     from calib.core.rig import Rig
-    from calib.io.logs import LOG, beside, read_log, write_log
+    from calib.io.logs import LOG, companion_files, read_log, write_log
     from calib.stages.align.join import DRIFT_S, joined
 
     if same_clock and offset is not None:
@@ -50,7 +50,7 @@ def join(
     if offset is not None and not math.isfinite(offset):
         raise UsageError(f"--offset: is {offset}, expected seconds")
     check_log_name(output)
-    note_inputs([camera, board, *beside(camera), *beside(board), *stated.files])
+    note_inputs([camera, board, *companion_files(camera), *companion_files(board), *stated.files])
     check_writable(output, LOG)
     known = Rig.load(rig, missing_ok=True)
     given = 0.0 if same_clock else offset

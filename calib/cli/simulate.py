@@ -63,7 +63,7 @@ def simulate(
     from calib.io.logs import SIMULATED, write_log
     from calib.twin.rig import SimulatedRig, rig_from_file
     from calib.twin.scenarios import make_scenario, run_scenario
-    from calib.twin.simulate import FEEDBACKS, log_of
+    from calib.twin.simulate import FEEDBACKS, run_log
 
     if feedback not in FEEDBACKS:
         raise UsageError(f"--feedback: {feedback!r} is not one of {', '.join(FEEDBACKS)}")
@@ -90,7 +90,7 @@ def simulate(
         plan = make_scenario(scenario, options)
         check_writable(output, SIMULATED)
         run = run_scenario(plan, machine, seed, feedback, duration_s)
-        log = log_of(run, shown(output))
+        log = run_log(run, shown(output))
         write_log(output, log, SIMULATED)
         figures = plan.figures(run)
         told |= {

@@ -159,10 +159,10 @@ class OneByDefault(TyperGroup):
 def _of_arm(args: list[str]) -> bool:
     """Whether the first argument that is a file is a log of a pressure-driven arm."""
     from calib.io.columns import is_arm_log
-    from calib.io.logs import columns_of
+    from calib.io.logs import read_column_names
 
     first = next((path for path in map(Path, args) if path.is_file()), None)
-    return first is not None and is_arm_log(columns_of(first) or ())
+    return first is not None and is_arm_log(read_column_names(first) or ())
 
 
 def group(name: str, words: str, cls: type[TyperGroup] = TyperGroup) -> typer.Typer:

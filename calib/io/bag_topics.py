@@ -66,7 +66,7 @@ class Topic:
     used: bool = True
 
 
-def in_use(topics: Sequence[Topic]) -> Sequence[Topic]:
+def used_topics(topics: Sequence[Topic]) -> Sequence[Topic]:
     """Those that have messages; all where none has."""
     return [topic for topic in topics if topic.used] or topics
 
@@ -109,7 +109,7 @@ def topic_map(bag: Path, topics: Sequence[Topic], given: Path | None = None) -> 
     Raises `BadInputError` naming the key for what is wrong, the topics of the bag for one it lacks.
     """
     place = find_topics(bag) if given is None else given
-    return _defaults(bag, topics) if place is None else _from_file(place, bag, topics)
+    return _defaults(bag, topics) if place is None else _read_topics_file(place, bag, topics)
 
 
 def _listed(topics: Sequence[Topic]) -> str:
@@ -142,7 +142,7 @@ def _fields(columns: Mapping[str, str]) -> tuple[Field, ...]:
 def _defaults(bag: Path, topics: Sequence[Topic]) -> TopicMap:
     source = shown(bag)
     found: dict[str, tuple[Field, ...]] = {}
-    topics = in_use(topics)
+    topics = used_topics(topics)
     imus = [topic for topic in topics if topic.kind == "sensor_msgs/Imu"]
     hint = f"say which in {shown(bag.stem)}.topics.yaml beside it"
     if len(imus) > 1:
@@ -163,10 +163,10 @@ def _defaults(bag: Path, topics: Sequence[Topic]) -> TopicMap:
         raise BadInputError(
             f"{source}: has no topic that is known by itself, found {_listed(topics)}; {hint}"
         )
-    return _checked(TopicMap(source, found))
+    return _check_columns_once(TopicMap(source, found))
 
 
-def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
+def _read_topics_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
     source, document = shown(place), read_yaml_mapping(place)
     for key in document:
         if key not in ("time", "topics"):
@@ -186,11 +186,11 @@ def _from_file(place: Path, bag: Path, topics: Sequence[Topic]) -> TopicMap:
             raise BadInputError(
                 f"{source}: the topic {quoted(name)} is not in {shown(bag)}, which has {_listed(topics)}"
             )
-        found[name] = _wanted(f"{source}: topics.{one_line(name)[:80]}", wanted, there[name])
-    return _checked(TopicMap(source, found, time == "stamp"))
+        found[name] = _parse_fields(f"{source}: topics.{one_line(name)[:80]}", wanted, there[name])
+    return _check_columns_once(TopicMap(source, found, time == "stamp"))
 
 
-def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
+def _parse_fields(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
     """The fields that one entry of the file asks for."""
     known = wanted in _PRESETS if isinstance(wanted, str) else isinstance(wanted, dict) and wanted
     if not known:
@@ -222,7 +222,7 @@ def _wanted(where: str, wanted: Any, topic: Topic) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def _checked(found: TopicMap) -> TopicMap:
+def _check_columns_once(found: TopicMap) -> TopicMap:
     """The map, if no column comes from two topics."""
     origin: dict[str, str] = {}
     for topic, fields in found.topics.items():
@@ -234,7 +234,7 @@ def _checked(found: TopicMap) -> TopicMap:
     return found
 
 
-def reader_of(source: str, topic: str, field: Field) -> Callable[[Any], float]:
+def field_reader(source: str, topic: str, field: Field) -> Callable[[Any], float]:
     """A function from a message to a column's value; NaN for a null.
 
     The function raises `BadInputError` where the message has no such field or it is no number.

@@ -19,7 +19,7 @@ from calib.core.errors import BadInputError, CalibError, package, pip_install
 from calib.core.files import check_readable, one_line, shown, to_be
 from calib.core.words import several
 from calib.io import unpacking
-from calib.io.bag_topics import Topic, TopicMap, reader_of, topic_map
+from calib.io.bag_topics import Topic, TopicMap, field_reader, topic_map
 from calib.io.tables import Block, Passed
 
 # ----------------------------------------------------------------------
@@ -158,7 +158,7 @@ def _chunks(
     """Stamps and values in the order of the file, some thousand messages at a time; `clocks` are filled."""
     slots = {name: k for k, name in enumerate(topics.columns)}
     readers: dict[str, list[tuple[int, Callable[[Any], float]]]] = {
-        name: [(slots[field.column], reader_of(source, name, field)) for field in fields]
+        name: [(slots[field.column], field_reader(source, name, field)) for field in fields]
         for name, fields in topics.topics.items()
     }
     stamps, values = np.empty(_ROWS, dtype=np.int64), np.full((_ROWS, len(slots)), np.nan)

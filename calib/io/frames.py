@@ -15,7 +15,7 @@ import numpy as np
 from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import VIDEOS, check_readable, hash_of, is_bag, one_line, shown
-from calib.io.pictures import Picture, decoded_picture, eight_bits, fields_of
+from calib.io.pictures import Picture, decoded_picture, eight_bits, split_fields
 
 # ----------------------------------------------------------------------
 # One pass over the frames. A stretch is a run of frames, of which the best is kept; when there are too
@@ -62,9 +62,9 @@ def read_frames(path: Path, topic: str | None = None) -> Frames:
     if path.suffix.lower() in VIDEOS:
         if topic is not None:
             raise UsageError(f"--topic: {shown(path)} is a video, and a topic goes with a bag")
-        stream = _of_video(path)
+        stream = _video_frames(path)
     else:
-        stream = _of_bag(path, topic)
+        stream = _bag_frames(path, topic)
     name = shown(path.name)
     kept, count = _best(stream)
     if not count:
@@ -72,7 +72,7 @@ def read_frames(path: Path, topic: str | None = None) -> Frames:
     digest = hash_of(path)
     pictures = tuple(
         Picture(f"{name} frame {number:05d}", digest, gray, (gray.shape[1], gray.shape[0]), second=second)
-        for number, (gray, second) in ((number, fields_of(frame)) for number, frame in kept)
+        for number, (gray, second) in ((number, split_fields(frame)) for number, frame in kept)
     )
     return Frames(name, digest, count, pictures)
 
@@ -91,10 +91,10 @@ def _best(stream: Iterable[GrayImage]) -> tuple[list[tuple[int, GrayImage]], int
     """
     stretches: list[_Best] = []
     length, count = 1, 0
-    for number, (gray, moved) in enumerate(_with_motion(stream)):
+    for number, (gray, moved) in enumerate(_measure_motion(stream)):
         count += 1
         most = 2 * max(_FEWEST_STRETCHES, min(_STRETCHES, _KEPT_PIXELS // (2 * gray.size)))
-        sharpness = _sharpness(fields_of(gray)[0])
+        sharpness = _sharpness(split_fields(gray)[0])
         one = _Best(number, sharpness**2 / max(sharpness + moved, 1e-9), gray)
         if number // length < len(stretches):
             stretches[-1] = _better(stretches[-1], one)
@@ -111,7 +111,7 @@ def _better(before: _Best, after: _Best) -> _Best:
     return before if after.worth <= before.worth else after
 
 
-def _with_motion(stream: Iterable[GrayImage]) -> Iterator[tuple[GrayImage, float]]:
+def _measure_motion(stream: Iterable[GrayImage]) -> Iterator[tuple[GrayImage, float]]:
     """Each frame, and the larger of its mean square differences from the one before and the one after.
 
     Of a camera that gives each frame twice one of them is nothing.
@@ -122,7 +122,7 @@ def _with_motion(stream: Iterable[GrayImage]) -> Iterator[tuple[GrayImage, float
         # A decoder may hand out the same memory again.
         after = gray.copy()
         if before is not None:
-            step = _apart(before, after)
+            step = _mean_square_difference(before, after)
             yield before, max(moved, step)
             moved = step
         before = after
@@ -130,7 +130,7 @@ def _with_motion(stream: Iterable[GrayImage]) -> Iterator[tuple[GrayImage, float
         yield before, moved
 
 
-def _apart(one: GrayImage, other: GrayImage) -> float:
+def _mean_square_difference(one: GrayImage, other: GrayImage) -> float:
     """Mean square difference of two frames, 0 of frames of unlike sizes."""
     if one.shape != other.shape:
         return 0.0
@@ -146,7 +146,7 @@ def _sharpness(gray: GrayImage) -> float:
     return sum(float(np.mean(np.square(d, dtype=np.float32))) if d.size else 0.0 for d in (along, down))
 
 
-def _of_video(path: Path) -> Iterator[GrayImage]:
+def _video_frames(path: Path) -> Iterator[GrayImage]:
     for frame in timed_frames(path)[1]:
         gray = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
         yield np.asarray(gray, dtype=np.uint8)
@@ -291,13 +291,13 @@ _COLOURS = {
 _GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 
 
-def _of_bag(path: Path, topic: str | None) -> Iterator[GrayImage]:
-    from calib.io.bag_topics import in_use
+def _bag_frames(path: Path, topic: str | None) -> Iterator[GrayImage]:
+    from calib.io.bag_topics import used_topics
     from calib.io.bags import opened_bag
 
     with opened_bag(path) as stream:
         pictures = [one for one in stream.topics if one.kind in (_IMAGE, _COMPRESSED)]
-        kinds = {one.name: one.kind for one in in_use(pictures)}
+        kinds = {one.name: one.kind for one in used_topics(pictures)}
         listed = ", ".join(one_line(name)[:80] for name in kinds) or "none"
         if topic is not None and topic not in kinds:
             raise BadInputError(f"{shown(path)}: has no image topic {one_line(topic)[:80]}; found {listed}")
@@ -316,7 +316,7 @@ def _of_bag(path: Path, topic: str | None) -> Iterator[GrayImage]:
                 if kinds[chosen] == _COMPRESSED:
                     gray = decoded_picture(bytes(message.data), where, where, "").gray
                 else:
-                    gray = _of_message(message, where)
+                    gray = _decode_image(message, where)
             except BadInputError as error:
                 # One damaged frame among many is no loss; if there is no other, it is the reason.
                 damage = damage or error
@@ -327,7 +327,7 @@ def _of_bag(path: Path, topic: str | None) -> Iterator[GrayImage]:
             raise damage
 
 
-def _of_message(message: Any, where: str) -> GrayImage:
+def _decode_image(message: Any, where: str) -> GrayImage:
     """Grey values of a sensor_msgs/Image."""
     encoding = str(message.encoding)
     height, width, step = int(message.height), int(message.width), int(message.step)

@@ -60,7 +60,7 @@ _ALIKE, _SECONDS_S = 4.0, 0.5
 """Rows that share a stamp, and what is between two stamps, from which on nothing tells when a reading was."""
 
 
-def with_units(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
+def infer_units(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap:
     """The map with all units, from what is stated and from the first readings of the log.
 
     Parameters
@@ -77,7 +77,7 @@ def with_units(columns: ColumnMap, cells: Mapping[str, FloatArray]) -> ColumnMap
     first = _FirstReadings(columns, {name: values[order] for name, values in cells.items()})
     # Damaged files hold any number.
     with np.errstate(all="ignore"):
-        for step in (_with_time_unit, _with_accel_unit, _with_gyro_unit):
+        for step in (_infer_time_unit, _infer_accel_unit, _infer_gyro_unit):
             first = step(first)
     columns = first.map
     for column, source in columns.sources.items():
@@ -134,7 +134,7 @@ class _FirstReadings:
         return f"give --{option}-unit {unit} or add to {self.map.folder} the line units: {{{kind}: {unit}}}"
 
 
-def _with_time_unit(first: _FirstReadings) -> _FirstReadings:
+def _infer_time_unit(first: _FirstReadings) -> _FirstReadings:
     source, units, cells = first.map.sources["t_s"], UNITS["time"], first.cells
     name = one_line(source.column)[:40]
     sensors = first.present((*ACCEL, *GYRO)) or first.present(("u_px",))
@@ -186,7 +186,7 @@ def calm_windows(values: FloatArray) -> FloatArray:
     return windows[np.argsort(loud, kind="stable")[: max(math.ceil(_CALM * len(windows)), 1)]]
 
 
-def _with_accel_unit(first: _FirstReadings) -> _FirstReadings:
+def _infer_accel_unit(first: _FirstReadings) -> _FirstReadings:
     names = first.present(ACCEL)
     stated = first.units(names)
     if names[:2] != ["ax_mps2", "ay_mps2"] or stated == {"counts"} or len(stated) > 1:
@@ -299,7 +299,7 @@ def turning(t_s: FloatArray, force: FloatArray, rates: FloatArray, factors: Sequ
     return Turning(flat, by_force, by_gyro, spread, share, whole)
 
 
-def _with_gyro_unit(first: _FirstReadings) -> _FirstReadings:
+def _infer_gyro_unit(first: _FirstReadings) -> _FirstReadings:
     names = first.present(GYRO)
     stated = first.units(names)
     if not names or stated == {"counts"} or len(stated) > 1 or len(first.rows(names)) < _FEWEST:

@@ -52,8 +52,8 @@ from calib.io.columns import (
     kind_of,
     own_unit,
 )
-from calib.io.inferred_units import with_units
-from calib.io.sensor_faults import FEWEST, Watch, clipped, marker_places
+from calib.io.inferred_units import infer_units
+from calib.io.sensor_faults import FEWEST, Watch, at_range_end, marker_places
 from calib.io.tables import (
     ALL_TAKEN,
     GENERAL,
@@ -175,7 +175,7 @@ class Log(InWords):
         if not counts:
             refuse_counts(self, wanted)
         check_time(self)
-        apart = None if partly else _apart(self, wanted)
+        apart = None if partly else _accel_at_gyro_times(self, wanted)
         log = self if apart is None else apart
         rows = log.sampled(*wanted, partly=partly)
         if len(rows) == 0:
@@ -189,7 +189,7 @@ class Log(InWords):
         values = np.stack([log.columns[name][rows] for name in wanted], axis=1)
         stamps = log.t_s[rows]
         # Of a burst, in which rows of other sensors lie between, both are readings.
-        twice = _again(stamps, values.T) & (np.diff(rows) == 1)
+        twice = _repeats_row_before(stamps, values.T) & (np.diff(rows) == 1)
         if twice.any():
             kept = np.concatenate([[True], ~twice])
             rows, stamps, values = rows[kept], stamps[kept], values[kept]
@@ -210,13 +210,13 @@ class Log(InWords):
         return [*([read_as] if read_as else []), *(f"{self.source}: {one}" for one in self.passed.sentences)]
 
 
-def _logs(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
+def _in_si(columns: ColumnMap, blocks: Iterator[Block]) -> Iterator[Log]:
     """Blocks in SI; the readings of the first tell the units that nobody states."""
-    blocks = _counted_on(blocks, columns.evidence.get("time") == "dates")
+    blocks = _unwrap_time(blocks, columns.evidence.get("time") == "dates")
     first = next((block for block in blocks if len(block.lines)), None)
     if first is None:
         return
-    known = with_units(columns, first.cells)
+    known = infer_units(columns, first.cells)
     unknown = known.unknown
     for block in chain([first], blocks):
         named = {n: known.sources[n].si(kind_of(n), v) for n, v in block.cells.items() if n != "t_s"}
@@ -229,7 +229,7 @@ _MOST = {"accel": 4000.0, "gyro": 140.0, "pixel": 1e5}
 _MOST_OUTSIDE, _SENTINELS = 0.05, 2
 
 
-def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
+def _blank_outside_picture(log: Log, size_px: tuple[int, int]) -> Log:
     """The log with blanks for markers outside of pictures of this width and height, and for those at (0, 0).
 
     Raises `BadInputError` where there are many, unless they hold the same few numbers, as those of a tracker
@@ -253,7 +253,7 @@ def _in_picture(log: Log, size_px: tuple[int, int]) -> Log:
     return replace(log, columns=columns, passed=log.passed + Passed(outside=int(outside.sum())))
 
 
-def within(log: Log) -> Log:
+def blank_impossible(log: Log) -> Log:
     """The log with blanks for cells that no sensor can have given."""
     far = {
         name: np.flatnonzero(np.abs(values) > _MOST.get(kind_of(name), math.inf))
@@ -274,20 +274,20 @@ def _blanked(log: Log, cells: Mapping[str, IntArray], passed: Callable[[int, str
     return log if told == log.passed else replace(log, columns=columns, passed=told)
 
 
-def unclipped(log: Log) -> Log:
+def blank_clipped(log: Log) -> Log:
     """The log with blanks for readings of the IMU at the end of their range: the truth is beyond."""
     names = (name for name in IMU if name in log.columns and log.unit(name) != "counts")
-    end = {name: np.flatnonzero(clipped(log.columns[name], kind_of(name) == "gyro")) for name in names}
+    end = {name: np.flatnonzero(at_range_end(log.columns[name], kind_of(name) == "gyro")) for name in names}
     return _blanked(log, end, lambda count, first: Passed(clipped=count, end=first))
 
 
-def _counted_on(blocks: Iterator[Block], dates: bool) -> Iterator[Block]:
+def _unwrap_time(blocks: Iterator[Block], dates: bool) -> Iterator[Block]:
     """Blocks whose times run on where they are those of a counter that begins again, or of the next day."""
     before, size, laps = math.nan, 0, 0
     for block in blocks:
         t = block.cells["t_s"]
         steps = np.diff(t, prepend=before)
-        size = size or _counter(t, steps, (_DAY_S,) if dates else _COUNTERS)
+        size = size or _counter_size(t, steps, (_DAY_S,) if dates else _COUNTERS)
         before = float(t[-1]) if len(t) else before
         if size:
             again = steps < -0.5 * size
@@ -298,7 +298,7 @@ def _counted_on(blocks: Iterator[Block], dates: bool) -> Iterator[Block]:
         yield block
 
 
-def _counter(t: FloatArray, steps: FloatArray, sizes: Sequence[int]) -> int:
+def _counter_size(t: FloatArray, steps: FloatArray, sizes: Sequence[int]) -> int:
     """Which of the sizes a counter has that times (n,) are those of, where it begins again; 0 otherwise."""
     back, usual = steps[steps < 0.0], steps[steps > 0.0]
     if not len(back) or not len(usual) or (sizes is _COUNTERS and not np.array_equal(t, np.floor(t))):
@@ -319,7 +319,7 @@ def iter_rows(
     ----------
     path : where it lies, beside which columns.yaml is looked for.
     """
-    yield from _logs(*text_blocks(stream, source, path or Path(source), options))
+    yield from _in_si(*text_blocks(stream, source, path or Path(source), options))
 
 
 def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
@@ -334,18 +334,18 @@ def _iter_bag(path: Path, options: LogOptions) -> Iterator[Log]:
     with bag_blocks(path, options.topics) as (left_out, blocks):
         first = next(blocks)
         columns = column_map(shown(path), path, 1, tuple(first.cells), columns_file(path, options), options)
-        yield from (replace(log, unknown=left_out) for log in _logs(columns, chain([first], blocks)))
+        yield from (replace(log, unknown=left_out) for log in _in_si(columns, chain([first], blocks)))
 
 
-def log_of(source: str, path: Path, cells: Mapping[str, FloatArray], options: LogOptions) -> Log:
+def log_from_cells(source: str, path: Path, cells: Mapping[str, FloatArray], options: LogOptions) -> Log:
     """A log of columns (n,) by name, `t_s` among them, that were read from a file of another kind.
 
     Raises `BadInputError` for units that contradict the readings.
     """
     columns = column_map(source, path, 1, tuple(cells), columns_file(path, options), options)
     lines = np.arange(1, len(cells["t_s"]) + 1, dtype=np.int64)
-    (log,) = _logs(columns, iter([Block(cells, lines)]))
-    return within(log)
+    (log,) = _in_si(columns, iter([Block(cells, lines)]))
+    return blank_impossible(log)
 
 
 def iter_log(
@@ -387,13 +387,18 @@ def iter_log(
     elif ending in STREAMS:
         blocks = iter_rows(io.BytesIO(stream_text(path).encode()), shown(path))
     else:
-        blocks = _logs(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
+        blocks = _in_si(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
     if as_it_is:
         return blocks
-    return (within(log) if picture_px is None else _in_picture(within(log), picture_px) for log in blocks)
+    return (
+        blank_impossible(log)
+        if picture_px is None
+        else _blank_outside_picture(blank_impossible(log), picture_px)
+        for log in blocks
+    )
 
 
-def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
+def read_column_names(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, ...] | None:
     """Columns that a log has by its header, whatever is in them; None where it cannot be told."""
     from calib.io.serial import STREAMS
 
@@ -408,7 +413,7 @@ def columns_of(path: Path, options: LogOptions = NOTHING_STATED) -> tuple[str, .
         return None
 
 
-def beside(path: Path) -> list[Path]:
+def companion_files(path: Path) -> list[Path]:
     """Files beside a log that say what is in it: which topic of a bag is which column, and columns.yaml."""
     from calib.io.bag_topics import find_topics
 
@@ -445,13 +450,13 @@ def read_log(
         lines=np.concatenate([block.lines for block in blocks]),
         passed=sum((block.passed for block in blocks), ALL_TAKEN),
     )
-    log = in_order(log)
+    log = sort_rows(log)
     if remarks is not None:
         remarks += log.remarks()
     return log
 
 
-def in_order(log: Log) -> Log:
+def sort_rows(log: Log) -> Log:
     """The log with rows sorted by time, where those of each writer are in order; else as it is.
 
     Sensors that are read by threads of their own write rows with columns of their own, as they come.
@@ -465,25 +470,25 @@ def in_order(log: Log) -> Log:
     back = np.diff(log.t_s[by_writer]) < 0.0
     if (back & (np.diff(writer[by_writer]) == 0)).any():
         return log
-    return _of_rows(log, np.argsort(log.t_s, kind="stable"), Passed(sorted=int(late.sum())))
+    return _select_rows(log, np.argsort(log.t_s, kind="stable"), Passed(sorted=int(late.sum())))
 
 
-def _of_rows(log: Log, rows: IntArray | BoolArray, passed: Passed) -> Log:
+def _select_rows(log: Log, rows: IntArray | BoolArray, passed: Passed) -> Log:
     """Some rows of a log, or all in another order, and what that has passed over."""
     columns = {name: column[rows] for name, column in log.columns.items()}
     passed = log.passed + passed
     return replace(log, t_s=log.t_s[rows], columns=columns, lines=log.lines[rows], passed=passed)
 
 
-def once(log: Log) -> Log:
+def drop_repeated_rows(log: Log) -> Log:
     """The log without rows that say what the one before says, at its time, which are no other readings."""
-    again = _again(log.t_s, log.columns.values())
+    again = _repeats_row_before(log.t_s, log.columns.values())
     if not again.any():
         return log
-    return _of_rows(log, np.concatenate([[True], ~again]), Passed(twice=int(again.sum())))
+    return _select_rows(log, np.concatenate([[True], ~again]), Passed(twice=int(again.sum())))
 
 
-def _again(t_s: FloatArray, columns: Iterable[FloatArray]) -> BoolArray:
+def _repeats_row_before(t_s: FloatArray, columns: Iterable[FloatArray]) -> BoolArray:
     """Which rows (n - 1,) but the first of all say what the one before says, at its time."""
     again: BoolArray = np.diff(t_s) == 0.0
     for column in columns:
@@ -659,7 +664,7 @@ _FAR_APART = 5.0
 """Steps of the accelerometer from which on what lies between is not known."""
 
 
-def _apart(log: Log, names: Sequence[str]) -> Log | None:
+def _accel_at_gyro_times(log: Log, names: Sequence[str]) -> Log | None:
     """The log with the accelerometer's readings at the gyroscope's times; None where they share their rows.
 
     Some drivers send each sensor by itself, at a rate of its own.

@@ -278,7 +278,7 @@ def decoded_picture(data: bytes, where: str, name: str, digest: str) -> Picture:
     if decoded is None or decoded.size == 0:
         raise BadInputError(f"{where}: is not a picture that can be decoded")
     height, width = decoded.shape[:2]
-    gray, second = fields_of(eight_bits(decoded))
+    gray, second = split_fields(eight_bits(decoded))
     return Picture(name, digest, gray, (width, height), count_pictures(data), second)
 
 
@@ -402,7 +402,7 @@ _LEAST_SLOPE = 2.0
 """Grey values per pixel, RMS over a cell of the grid."""
 
 
-def fields_of(gray: GrayImage) -> tuple[GrayImage, GrayImage | None]:
+def split_fields(gray: GrayImage) -> tuple[GrayImage, GrayImage | None]:
     """The two fields of an interlaced picture, rows of the other interpolated; any other picture, alone.
 
     Odd rows of an interlaced picture are of another moment, in which the board stood d pixels beside: their
@@ -427,10 +427,10 @@ def fields_of(gray: GrayImage) -> tuple[GrayImage, GrayImage | None]:
     moved = sloping & (both**2 > _SHARE * squares * offs) & (abs(both) > _MOVED_PX * squares)
     if max(np.count_nonzero(moved & (both > 0.0)), np.count_nonzero(moved & (both < 0.0))) < _FEWEST:
         return gray, None
-    return _of_field(gray, 0), _of_field(gray, 1)
+    return _interpolate_field(gray, 0), _interpolate_field(gray, 1)
 
 
-def _of_field(gray: GrayImage, first: int) -> GrayImage:
+def _interpolate_field(gray: GrayImage, first: int) -> GrayImage:
     """The rows from `first` on, every other, and those between interpolated."""
     own = np.pad(gray[first::2].astype(np.float32), ((2, 3), (0, 0)), mode="edge")
     whole = gray.copy()

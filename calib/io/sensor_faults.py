@@ -87,13 +87,13 @@ class Watch:
             if len(finite):
                 least, most = min(least, float(finite.min())), max(most, float(finite.max()))
             self._seen[name] = count + len(finite), least, most
-        self._stuck = self._stuck or _frozen(log, self.names)
+        self._stuck = self._stuck or _stuck_axis(log, self.names)
         if all(name in log.columns and name in self.names for name in IN_PLANE):
             if not self._sign_known:
-                self._sign_known, self._mirrored = _mirrored(log)
+                self._sign_known, self._mirrored = _mirrored_axes(log)
             self._silent = self._silent or _silent_gyro(log)
-        self.held = _held(log) if set(self.names) & set(IMU) else []
-        self._stopped = self._stopped or _stopped(log, self.held)
+        self.held = _held_rows(log) if set(self.names) & set(IMU) else []
+        self._stopped = self._stopped or _imu_stopped(log, self.held)
 
     def has(self, *names: str) -> bool:
         """Whether each of these columns has a reading."""
@@ -121,7 +121,7 @@ class Watch:
         return [*out, *(one for one in more if one is not None)]
 
 
-def _held(log: Rows) -> list[tuple[int, int]]:
+def _held_rows(log: Rows) -> list[tuple[int, int]]:
     """Rows, from and to, in which the whole IMU repeats one reading for longer than chance and steps explain.
 
     Of an IMU with at least one axis of each sensor and three in all; the first of equal readings is not among
@@ -132,7 +132,7 @@ def _held(log: Rows) -> list[tuple[int, int]]:
     if len(names) < 3 or not set(names) & set(ACCEL) or not set(names) & set(GYRO) or len(rows) < FEWEST:
         return []
     same = np.logical_and.reduce(_repeats(log, names, rows))
-    return [(int(rows[a + 1]), int(rows[b]) + 1) for a, b in _lasting(same, log.t_s[rows])]
+    return [(int(rows[a + 1]), int(rows[b]) + 1) for a, b in _long_repeats(same, log.t_s[rows])]
 
 
 def _repeats(log: Rows, names: Sequence[str], rows: IntArray) -> BoolArray:
@@ -141,7 +141,7 @@ def _repeats(log: Rows, names: Sequence[str], rows: IntArray) -> BoolArray:
     return np.asarray(values[:, 1:] == values[:, :-1])
 
 
-def _lasting(same: BoolArray, t_s: FloatArray) -> list[tuple[int, int]]:
+def _long_repeats(same: BoolArray, t_s: FloatArray) -> list[tuple[int, int]]:
     """Runs of repetitions, from and to, longer than chance and steps explain; none where all are."""
     share = float(same.mean())
     if not 0.0 < share < 1.0:
@@ -150,7 +150,7 @@ def _lasting(same: BoolArray, t_s: FloatArray) -> list[tuple[int, int]]:
     return [(a, b) for a, b in runs(same) if b - a >= least and t_s[b] - t_s[a] >= _HELD_S]
 
 
-def _frozen(log: Rows, names: Sequence[str]) -> Finding | None:
+def _stuck_axis(log: Rows, names: Sequence[str]) -> Finding | None:
     """The first of these columns that repeats one reading while other axes of its sensor go on changing."""
     for sensor in (GYRO, ACCEL):
         axes = [name for name in sensor if name in log.columns]
@@ -160,7 +160,7 @@ def _frozen(log: Rows, names: Sequence[str]) -> Finding | None:
         same = _repeats(log, axes, rows)
         for k, name in enumerate(axes):
             others = np.delete(same, k, axis=0)
-            for a, b in _lasting(same[k], log.t_s[rows]) if name in names else ():
+            for a, b in _long_repeats(same[k], log.t_s[rows]) if name in names else ():
                 if others[:, a:b].mean() < _OTHERS_REPEAT:
                     value, stamps = log.columns[name][rows[a]], log.t_s[rows]
                     text = f"{name} is stuck at {value:.6g} from {stamps[a]:.1f} to {stamps[b]:.1f} s"
@@ -168,7 +168,7 @@ def _frozen(log: Rows, names: Sequence[str]) -> Finding | None:
     return None
 
 
-def _stopped(log: Rows, held: Sequence[tuple[int, int]]) -> Finding | None:
+def _imu_stopped(log: Rows, held: Sequence[tuple[int, int]]) -> Finding | None:
     """That the whole IMU stops answering, where it does."""
     if not held:
         return None
@@ -260,7 +260,7 @@ def _unanswered_turns(
     )
 
 
-def _mirrored(log: Rows) -> tuple[bool, Finding | None]:
+def _mirrored_axes(log: Rows) -> tuple[bool, Finding | None]:
     """Whether a log turns far enough to tell which way, and what is wrong about it."""
     rows = log.sampled(*IN_PLANE)[:_WINDOW]
     if len(rows) < 2 * FEWEST:
@@ -295,7 +295,7 @@ _ACCEL_RANGES = tuple(g * GRAVITY_MPS2 for g in (2.0, 4.0, 8.0, 16.0, 32.0))
 _CLIPPED_IN_A_ROW = 3
 
 
-def clipped(values: FloatArray, gyro: bool) -> BoolArray:
+def at_range_end(values: FloatArray, gyro: bool) -> BoolArray:
     """Which readings (n,) are at the end of a range that sensors have, where some stay there in a row."""
     out = np.zeros(len(values), dtype=np.bool_)
     known = values[np.isfinite(values)]

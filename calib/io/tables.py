@@ -359,7 +359,7 @@ def _numeric(cells: Sequence[str], separator: str) -> bool:
     return bool(words) and all(plain_number(w) is not None or _date_s(w) is not None for w in words)
 
 
-def _opened(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
+def _layout_of(stream: BinaryIO, source: str, path: Path, options: LogOptions) -> tuple[_Text, bytes, int]:
     """How the text is made up, the beginning of its rows, which was read on the way, and their line."""
     file = columns_file(path, options)
     line, raw, comment, ahead, above = _first_line(stream, file)
@@ -502,7 +502,7 @@ def text_blocks(
     stream: BinaryIO, source: str, path: Path, options: LogOptions
 ) -> tuple[ColumnMap, Iterator[Block]]:
     """Columns of a text log that is open, and its rows; columns.yaml is looked for beside `path`."""
-    text, data, line = _opened(stream, source, path, options)
+    text, data, line = _layout_of(stream, source, path, options)
     return text.columns, _timed(text.columns, _blocks(text, stream, data, line))
 
 

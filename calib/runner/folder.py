@@ -86,7 +86,7 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     Raises `BadInputError` where there is no such folder, or nothing in it.
     """
     from calib.io.columns import is_arm_log
-    from calib.io.logs import columns_of
+    from calib.io.logs import read_column_names
     from calib.io.states import STATES_FILE
 
     if not root.is_dir():
@@ -123,7 +123,7 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
             states.append(path)
         else:
             name = slug(path.stem, (log.slug for log in logs))
-            logs.append(LogFile(path, name, columns_of(path, options), _kind(path.name)))
+            logs.append(LogFile(path, name, read_column_names(path, options), _kind(path.name)))
     own = root / "rig.yaml"
     rig = own if own.is_file() and taken(own) else None
     beside = [
@@ -131,7 +131,7 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
         for path in _listed(root, LOGS)
         if path.is_file()
         and not path.is_symlink()
-        and columns_of(path, options)
+        and read_column_names(path, options)
         and not STATES_FILE.ours(path)
     ]
     left_out += _passed_over(root, flat, beside, {*pictures, *plane})
@@ -236,9 +236,9 @@ def _kind(name: str) -> str:
 
 def with_beside(logs: Iterable[Path]) -> tuple[Path, ...]:
     """Logs, each followed by the files beside it that say what is in it."""
-    from calib.io.logs import beside
+    from calib.io.logs import companion_files
 
-    return tuple(dict.fromkeys(part for path in logs for part in (path, *beside(path))))
+    return tuple(dict.fromkeys(part for path in logs for part in (path, *companion_files(path))))
 
 
 def folder_digests(folder: Folder) -> dict[Path, str]:

@@ -416,11 +416,11 @@ def _of_tracking(figures: Tracking) -> dict[str, float | None]:
 def _filtered(base: Base, known: Rig, run: Any) -> dict[str, float | None]:
     from calib.io.logs import write_log
     from calib.stages.estimator.replay import replay_log
-    from calib.twin.simulate import log_of
+    from calib.twin.simulate import run_log
 
     with tempfile.TemporaryDirectory(prefix="case-") as place:
         path = Path(place) / "log.csv"
-        write_log(path, log_of(run, "log"))
+        write_log(path, run_log(run, "log"))
         replayed = replay_log(path, known, _HERE, base.name, model=base.model)
     out: dict[str, float | None] = dict(replayed.rmse)
     for other, errors in replayed.compared.items():

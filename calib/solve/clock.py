@@ -191,7 +191,7 @@ def time_axis(stamps_s: FloatArray) -> TimeAxis:
     samples, weighted, even, burst = 0, 0.0, np.zeros(len(starts), dtype=np.bool_), 1
     for k, (first, last) in enumerate(_stretches(starts, len(t))):
         places[first:last] = np.arange(last - first)
-        stretch = _steady(t[first:last])
+        stretch = _fit_stretch(t[first:last])
         if stretch is not None:
             times[first:last], places[first:last], period, longest = stretch
             even[k], burst = True, max(burst, longest)
@@ -217,7 +217,7 @@ def clock_step_s(stamps_s: FloatArray) -> float:
     return least / next(whole, math.inf)
 
 
-def _coarse(t: FloatArray) -> tuple[float, float] | None:
+def _coarse_clock(t: FloatArray) -> tuple[float, float] | None:
     """Step of the clock of a stretch and its samples' period, where these are about as long; else None."""
     step = clock_step_s(t) if len(t) >= 2 * _LONG_LAG else 0.0
     if step == 0.0:
@@ -238,7 +238,7 @@ def _coarse(t: FloatArray) -> tuple[float, float] | None:
     return (step, period) if whole and np.mean(np.ptp(off, axis=1) < _WITHIN * step) > 0.5 else None
 
 
-def _spread(t: FloatArray, step: float) -> FloatArray:
+def _spread_stamps(t: FloatArray, step: float) -> FloatArray:
     """Stamps of a clock with this step, those that are one spread over it."""
     first = np.flatnonzero(np.diff(t, prepend=-math.inf) > 0.0)
     count = np.diff(first, append=len(t))
@@ -251,7 +251,7 @@ def _stretches(starts: IntArray, n: int) -> Iterator[tuple[int, int]]:
     return pairwise([*starts.tolist(), n])
 
 
-class _Counted(NamedTuple):
+class _Anchors(NamedTuple):
     """By which stamps the samples of a stretch are counted.
 
     Attributes
@@ -274,30 +274,32 @@ class _Counted(NamedTuple):
         return len(self.anchors) < len(self.t)
 
 
-def _counted_by(t: FloatArray, steps: FloatArray) -> _Counted:
-    everyone, coarse = np.arange(len(t)), _coarse(t)
+def _choose_anchors(t: FloatArray, steps: FloatArray) -> _Anchors:
+    everyone, coarse = np.arange(len(t)), _coarse_clock(t)
     if coarse is not None:
         step, period = coarse
-        return _Counted(_spread(t, step), everyone, [period], 2.0 + 2.0 * step / period, 2 * _LONG_LAG + 1)
+        return _Anchors(
+            _spread_stamps(t, step), everyone, [period], 2.0 + 2.0 * step / period, 2 * _LONG_LAG + 1
+        )
     anchors = _anchors(t)
     # One burst may hold a sample more than the next: over few of them that counts, over many what is missing.
     lags = [lag for lag in (_LAG, _LONG_LAG) if lag < len(anchors) < len(t)]
     periods = [_burst_period(t, anchors, lag) for lag in lags] or [_rough_period(t, steps)]
-    return _Counted(t, anchors, periods, len(t) / len(anchors), _WINDOW)
+    return _Anchors(t, anchors, periods, len(t) / len(anchors), _WINDOW)
 
 
-def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | None:
+def _fit_stretch(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | None:
     """Times, places, period and longest burst of a stretch; None for a sensor that is not steady."""
     steps = np.diff(t)
     steps = steps[steps > 1e-6]
     if len(t) < _LEAST_SAMPLES or len(steps) < _LEAST_SAMPLES // 2:
         return None
-    by = _counted_by(t, steps)
+    by = _choose_anchors(t, steps)
     t, anchors, count = by.t, by.anchors, np.diff(by.anchors, prepend=-1)
-    lined_up = _lined_up(by)
+    lined_up = _first_line(by)
     if lined_up is None:
         return None
-    k, origin, period, wander = _gaps_settled(by, *lined_up)
+    k, origin, period, wander = _settle_gaps(by, *lined_up)
     # Samples of a burst come before its last; what is missing is missing before the burst.
     places = np.arange(len(t)) + np.repeat(k - anchors, count).astype(np.int64)
     times = origin + period * places + np.interp(places, k, wander)
@@ -311,7 +313,7 @@ def _steady(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | None:
     return None if _is_wrong(off, len(t)) else (times, places - places[0], period, int(count.max()))
 
 
-def _lined_up(by: _Counted) -> tuple[FloatArray, float, float] | None:
+def _first_line(by: _Anchors) -> tuple[FloatArray, float, float] | None:
     """Numbers k (m,) of the anchors on a line, its origin and period; None where they are on none."""
     later = _LATER if by.bursts else 0.0
     lines: list[tuple[tuple[float, float, float], FloatArray]] = []
@@ -319,16 +321,16 @@ def _lined_up(by: _Counted) -> tuple[FloatArray, float, float] | None:
     for period, held in product(by.periods, (False, True)):
         if by.bursts or not lines:
             t = by.t[by.anchors]
-            k = _counted(t, by.anchors, period, _UNEVEN * by.size, by.window, later, held)
-            lines += [] if k is None else [(_line(k, t), k)]
+            k = _count_samples(t, by.anchors, period, _UNEVEN * by.size, by.window, later, held)
+            lines += [] if k is None else [(_fit_line(k, t), k)]
     if not lines:
         return None
     (origin, period, _), k = min(lines, key=lambda one: one[0][2])
     return (k, origin, period) if period > 0.0 else None
 
 
-def _gaps_settled(
-    by: _Counted, k: FloatArray, origin: float, period: float
+def _settle_gaps(
+    by: _Anchors, k: FloatArray, origin: float, period: float
 ) -> tuple[FloatArray, float, float, FloatArray]:
     """Numbers k (m,) of the anchors with gaps in their places, the line's origin and period, wander (m,)."""
     t, anchors = by.t, by.anchors
@@ -347,7 +349,7 @@ def _gaps_settled(
             break
         # Gaps in their wrong places bend the line, so that the next look sees more of them.
         k = moved
-        origin, period, _ = _line(k, t[anchors])
+        origin, period, _ = _fit_line(k, t[anchors])
     return k, origin, period, wander
 
 
@@ -394,7 +396,7 @@ def _running_median(values: FloatArray, window: int = _WINDOW) -> FloatArray:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, window), axis=1))
 
 
-def _on_line(
+def _round_to_line(
     t: FloatArray, i: IntArray, origin: float, period: float, window: int, later: float
 ) -> FloatArray:
     """Number k (n,) on the line of each of the samples i (n,), rising as they do or faster."""
@@ -407,7 +409,7 @@ def _on_line(
     return np.asarray(np.rint(isotonic_regression(behind).x) + i)
 
 
-def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
+def _fit_line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
     """Origin, period and robust deviation of stamps (n,) over numbers (n,)."""
     use = np.ones(len(t), dtype=np.bool_)
     origin, period, spread = float(t[0]), 1.0, 0.0
@@ -425,7 +427,7 @@ def _line(k: FloatArray, t: FloatArray) -> tuple[float, float, float]:
     return origin, period, spread
 
 
-def _counted(
+def _count_samples(
     t: FloatArray, i: IntArray, period: float, uneven: float, window: int, later: float, held: bool
 ) -> FloatArray | None:
     """Numbers k (n,) of the samples i (n,), by `window` of them at a time; None where they are not steady.
@@ -440,7 +442,7 @@ def _counted(
     while done < len(t):
         end = min(done + chunk, len(t))
         since = max(done - window, 0)
-        counted = _on_line(t[since:end], i[since:end], origin, period, window, later)
+        counted = _round_to_line(t[since:end], i[since:end], origin, period, window, later)
         # Numbers that are known stay; those after them go on rising.
         k[done:end] = counted[done - since :]
         if done:
@@ -451,12 +453,12 @@ def _counted(
             # The clock bends: it is looked less far ahead, from a line that reaches less far back.
             chunk //= 2
             recent = slice(max(done - 2 * chunk, 0), done)
-            origin, period, _ = _line(k[recent], t[recent])
+            origin, period, _ = _fit_line(k[recent], t[recent])
             if not period > 0.0:
                 return None
             continue
         recent = slice(max(end - 2 * chunk, 0), end)
-        origin, period, spread = _line(k[recent], t[recent])
+        origin, period, spread = _fit_line(k[recent], t[recent])
         if held and not done and end < len(t):
             origin, period = float(np.median(t[recent] - nominal * k[recent])), nominal
         if not 0.5 * nominal < period < 2.0 * nominal or spread > uneven * period:

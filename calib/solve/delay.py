@@ -79,7 +79,7 @@ _CLEAR = 0.25
 """Share of an angle that a long delay leaves, at most."""
 
 
-def _about(late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:
+def _rough_delay(late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad: FloatArray) -> float:
     """The delay [s], to 5 ms, that leaves the least; 0 where that is a usual one, or leaves hardly less."""
     # Of a swing a period early the rest has the same shape and is larger.
     left = shares(moments(late_s, late_rad, t_s, turned_rad, _LONG_S, _FEWEST), 1.0)[1]
@@ -87,7 +87,7 @@ def _about(late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, turned_rad
     return float(_LONG_S[k]) if left[k] < min(_CLEAR, 0.5 * usual) else 0.0
 
 
-def delay_of(
+def estimate_delay(
     late_s: FloatArray, late_rad: FloatArray, t_s: FloatArray, phi_rad: FloatArray, turned_rad: FloatArray
 ) -> float:
     """By how much [s] one angle (m,) is later than another (n,), from -20 to 800 ms; 0 for standing still.
@@ -100,7 +100,7 @@ def delay_of(
     """
     seen = np.isfinite(late_rad)
     at, late = late_s[seen], late_rad[seen]
-    middle = _about(at, late, t_s, turned_rad)
+    middle = _rough_delay(at, late, t_s, turned_rad)
     delays = middle + _USUAL_S[:41] if middle else _USUAL_S
     known = (at > t_s[0] + float(delays[-1]) + 0.01) & (at < t_s[-1] - 0.03)
     if int(known.sum()) < _FEWEST:
@@ -156,7 +156,7 @@ class Clocks:
     next_left: float
 
 
-def _on_grid(
+def _grid_rates(
     t_s: FloatArray, values: FloatArray, others_s: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Times of a grid, rates there, and whether they are between samples that are close together.
@@ -178,7 +178,9 @@ def _on_grid(
     return at[middle : middle + len(rate)], rate, near[_OVER:] & near[:-_OVER]
 
 
-def _left(seen: FloatArray, known: BoolArray, felt: FloatArray, most: float) -> tuple[FloatArray, BoolArray]:
+def _unexplained_shares(
+    seen: FloatArray, known: BoolArray, felt: FloatArray, most: float
+) -> tuple[FloatArray, BoolArray]:
     """left (n,) at the delays 1 - len(seen) .. len(felt) - 1 of grids, and where half is shared.
 
     Where too little is shared to say anything, all is left. `most` as in `shares`.
@@ -210,8 +212,8 @@ def clocks(
     camera_s, way : (n,) times and angle phi [rad], or with `scaled` False any measure of the motion.
     imu_s, gz_radps : (m,) times and rates.
     """
-    at, seen, known = _on_grid(camera_s, way, imu_s)
-    felt_s, felt, _ = _on_grid(imu_s, -integral(imu_s, gz_radps - np.median(gz_radps)), camera_s)
+    at, seen, known = _grid_rates(camera_s, way, imu_s)
+    felt_s, felt, _ = _grid_rates(imu_s, -integral(imu_s, gz_radps - np.median(gz_radps)), camera_s)
     if known.sum() < 10 * _OVER or len(felt) < 10 * _OVER:
         return None
 
@@ -222,12 +224,12 @@ def clocks(
 
     def offset(known: BoolArray) -> tuple[float, float, float, bool]:
         """Offset, what it and its next leave, and whether that is clear."""
-        left, half = _left(seen, known, felt, 1.0 if scaled else np.inf)
+        left, half = _unexplained_shares(seen, known, felt, 1.0 if scaled else np.inf)
         k = int(np.argmin(np.where(half, left, np.inf)))
         following = rival(left, k)
         clear = float(left[k]) <= min(_MOST_LEFT, _APART * following)
         if scaled and clear:
-            roughly = _left(seen, known, felt, _SCALE)[0]
+            roughly = _unexplained_shares(seen, known, felt, _SCALE)[0]
             least = float(roughly[max(k - _NEAR, 0) : k + _NEAR + 1].min())
             clear = least <= _ROUGHLY_APART * rival(roughly, k)
         part = vertex(*left[k - 1 : k + 2].tolist()) if 0 < k < len(left) - 1 else 0.0

@@ -28,7 +28,7 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.scene import PrintedBoard, corner_pixels
 from calib.twin.sensors import View
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 _PICTURES_SEEDS = 10_000
 """From one seed to the next, for the pictures' noise; those of one folder lie below it."""
@@ -101,7 +101,7 @@ def _write(
     for index, (name, (scenario, options)) in enumerate(LOGS.items()):
         run = run_scenario(make_scenario(scenario, options), rig, len(LOGS) * seed + index, feedback)
         written.append(Path("logs") / f"{name}.csv")
-        write_atomically(folder / written[-1], log_text(log_of(run, name)))
+        write_atomically(folder / written[-1], log_text(run_log(run, name)))
         if progress is not None:
             progress(index + 1, len(LOGS))
     write_atomically(

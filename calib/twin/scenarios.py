@@ -32,7 +32,7 @@ from calib.stages.control.references import Ellipse, PolynomialElongation
 from calib.stages.control.tracking import settling_s
 from calib.twin.rig import SimulatedRig, rig_from_file
 from calib.twin.sensors import stream, uniform
-from calib.twin.simulate import Law, Run, Seen, log_of, ticks_in
+from calib.twin.simulate import Law, Run, Seen, count_ticks, run_log
 from calib.twin.simulate import simulate as run_loop
 
 # ----------------------------------------------------------------------
@@ -483,7 +483,7 @@ def run_scenario(
     Raises `BadInputError` as `simulate`.
     """
     duration = scenario.duration_s if duration_s is None else duration_s
-    return scenario.run(rig, ticks_in(duration, rig.pump.tick_s), seed, feedback)
+    return scenario.run(rig, count_ticks(duration, rig.pump.tick_s), seed, feedback)
 
 
 def simulate(
@@ -512,4 +512,4 @@ def simulate(
     machine = SimulatedRig() if rig is None else rig_from_file(rig)
     plan = make_scenario(scenario, settings)
     duration_s = parse_duration_s(duration, "duration") if isinstance(duration, str) else duration
-    return log_of(run_scenario(plan, machine, seed, feedback, duration_s), scenario)
+    return run_log(run_scenario(plan, machine, seed, feedback, duration_s), scenario)

@@ -230,7 +230,7 @@ def _close_loop(
     return pwm, seen
 
 
-def ticks_in(duration_s: float, tick_s: float) -> int:
+def count_ticks(duration_s: float, tick_s: float) -> int:
     """Ticks of a run. Raises `BadInputError` for none, and for a run of more than `LONGEST_S`."""
     if not 0.5 * tick_s < duration_s < LONGEST_S + 0.5 * tick_s:
         raise BadInputError(
@@ -260,13 +260,13 @@ def simulate(
 
     Raises
     ------
-    BadInputError as `ticks_in`, and for a start without lengths, parameters too stiff for the step, and a
+    BadInputError as `count_ticks`, and for a start without lengths, parameters too stiff for the step, and a
     motion that leaves the model.
     """
     if feedback not in FEEDBACKS:
         raise BadInputError(f"feedback: found {feedback!r}, expected one of {', '.join(FEEDBACKS)}")
     tick_s = rig.pump.tick_s
-    ticks_in(ticks * tick_s, tick_s)
+    count_ticks(ticks * tick_s, tick_s)
     check_start(start.row)
     body = rig.plant if plant is None else plant
     moving = _Plant(rig, body)
@@ -291,7 +291,7 @@ def simulate(
     return Run(rig, body, whole, pwm, tick_s, seen, sensors)
 
 
-def log_of(run: Run, source: str = "simulated") -> Log:
+def run_log(run: Run, source: str = "simulated") -> Log:
     """The log of a run: ticks and IMU samples merged by their time stamps, with the truth."""
     sensors = run.sensors
     ticks, samples = len(run.pwm), len(sensors.imu.stamp_s)

@@ -18,20 +18,20 @@ from calib.core.errors import BadInputError
 from calib.core.rig import Rig
 from calib.io.columns import QUATERNION, is_arm_log, known_name
 from calib.io.logs import Log, read_log
-from calib.stages.arm.frame import check_frame, frame_findings, frame_of, trial_of
+from calib.stages.arm.frame import check_frame, fit_frame, frame_findings, resample_trial
 from calib.stages.arm.identify import (
     FULL,
     _coverage,
     angle_error,
     best_baseline,
-    by_pressure,
-    errors_by,
-    errors_of,
     fit,
-    gained,
+    fit_errors,
+    gain_over_baseline,
     half_width,
     identify,
-    mean_of,
+    mean_error,
+    parameter_errors,
+    residuals_by_pressure,
 )
 from calib.stages.arm.model import (
     COMPLIANCE,
@@ -40,13 +40,13 @@ from calib.stages.arm.model import (
     STEP_S,
     Assembly,
     Trial,
+    data_scale,
     drive_run,
     load_bends,
-    scale_of,
+    parameters_on_day,
     segment_run,
-    values_on,
 )
-from calib.stages.arm.recording import recording_of
+from calib.stages.arm.recording import read_recording
 from calib.stages.arm.stage import _outlying_trials
 
 
@@ -59,7 +59,9 @@ def trials() -> list[Trial]:
 
 def test_a_fit_predicts_trials_that_it_has_not_seen(trials: list[Trial]) -> None:
     made = fit(trials, FULL.without("creep", "load"), SCALE)
-    unseen = errors_by(values_on("b", made.values, made.days), simulated("b_2", 7, "b", gain=1.1))
+    unseen = parameter_errors(
+        parameters_on_day("b", made.values, made.days), simulated("b_2", 7, "b", gain=1.1)
+    )
     assert math.degrees(unseen["angle_rad"]) < 0.5
     assert unseen["chord_m"] < 5e-4
     assert abs(made.values["lag_s"] / TRUE["lag_s"] - 1.0) < 0.1
@@ -70,7 +72,7 @@ def test_a_fit_predicts_trials_that_it_has_not_seen(trials: list[Trial]) -> None
 def test_an_identification_beats_black_boxes_and_says_by_how_much(trials: list[Trial]) -> None:
     found = identify(trials, compare=False)
     assert set(found.held) == {"a_0", "a_1", "b_2", "b_3"}
-    mean, half = gained(found, best_baseline(found, "angle_rad"), "angle_rad")
+    mean, half = gain_over_baseline(found, best_baseline(found, "angle_rad"), "angle_rad")
     assert mean > 0.2
     assert half > 0.0
     assert found.coverage > 0.9
@@ -138,7 +140,7 @@ def test_a_pump_fills_until_its_flow_leaves_by_the_orifice() -> None:
         assert delivers * (1.0 - kpa / 60.0) == pytest.approx(leaves, rel=0.01, abs=0.1)
     # What it delivers is told by no angle; its size is that of the air.
     assert (
-        scale_of([replace(trial, angle_rad=np.linspace(0.0, 0.5, n), chord_m=np.full(n, 0.2))]).pressure_kpa
+        data_scale([replace(trial, angle_rad=np.linspace(0.0, 0.5, n), chord_m=np.full(n, 0.2))]).pressure_kpa
         > 100.0
     )
 
@@ -195,7 +197,7 @@ def test_the_interval_of_trials_without_a_command_is_that_of_their_pressure(tria
     """There was none."""
     quiet = [replace(one, command=np.zeros(0)) for one in trials]
     made = fit(quiet, FULL.without("creep", "load"), SCALE)
-    errors = {one.name: errors_of(made, one) for one in quiet}
+    errors = {one.name: fit_errors(made, one) for one in quiet}
     assert all(0.0 < angle_error(one) < math.radians(1.0) for one in errors.values())
     assert _coverage(quiet, dict.fromkeys(errors, made), errors) > 0.9
 
@@ -230,13 +232,16 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
     assert before.text() == rig.text()
     old = Rig.of({"schema": 2, "arm": section | {"verdict": "ok", "days": {"a": 1.1}}}, "rig.yaml").arm
     assert old is not None
-    assert old.values_on("a")["bends_rad_per_kpa"] == pytest.approx(1.1)
-    assert old.values_on("another")["bends_rad_per_kpa"] == pytest.approx(1.1)
+    assert old.parameters_on_day("a")["bends_rad_per_kpa"] == pytest.approx(1.1)
+    assert old.parameters_on_day("another")["bends_rad_per_kpa"] == pytest.approx(1.1)
     fewer = {name: 2.0 for name in small.names if not name.startswith("lengthens")}
     old = Rig.of({"schema": 2, "arm": section | {"verdict": "ok", "parameters": fewer}}, "rig.yaml").arm
     assert old is not None
     assert old.parameters == fewer
-    assert (old.values_on("a")["lengthens_s"], old.values_on("a")["lengthens_per_kpa"]) == (1.0, 0.0)
+    assert (old.parameters_on_day("a")["lengthens_s"], old.parameters_on_day("a")["lengthens_per_kpa"]) == (
+        1.0,
+        0.0,
+    )
     names = [name for name in ("valve", *small.parts) if name != "lag"]
     # Twice without a load, as one rig must not change how another is read.
     for parts in (names, [*names, "load"], names):
@@ -245,8 +250,8 @@ def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
         of = section | {"verdict": "ok", "parts": parts, "parameters": plain}
         old = Rig.of({"schema": 2, "arm": of}, "rig.yaml").arm
         assert old is not None
-        assert old.values_on("a")["pilot_jump_kpa"] == NO_JUMP_KPA
-        assert old.values_on("a")["compliance_across_rad_per_Nm"] == 0.0
+        assert old.parameters_on_day("a")["pilot_jump_kpa"] == NO_JUMP_KPA
+        assert old.parameters_on_day("a")["compliance_across_rad_per_Nm"] == 0.0
     with pytest.raises(BadInputError, match=r"expected factors of .*bends_rad_per_kpa, not of lag_s"):
         Rig.of({"arm": section | {"verdict": "ok", "days": {"a": {"lag_s": 1.1}}}}, "rig.yaml")
     with pytest.raises(BadInputError, match="actuator is a pressure_arm and there is an arm"):
@@ -314,8 +319,8 @@ def test_plane_axis_and_convention_are_found(conjugated: bool, case: str) -> Non
     trial = replace(trial, angle_rad=share * trial.angle_rad)
     columns = _mounted(columns_of(trial, conjugated), Rotation.from_rotvec(mount), conjugated)
     columns = _turned(columns, Rotation.from_rotvec(turn), conjugated)
-    recording = recording_of(_log(columns, trial), "a")
-    frame = frame_of([recording])
+    recording = read_recording(_log(columns, trial), "a")
+    frame = fit_frame([recording])
     assert frame.axis is not None
     assert frame.direction is not None
     assert abs(frame.axis[2]) > 0.999
@@ -325,7 +330,7 @@ def test_plane_axis_and_convention_are_found(conjugated: bool, case: str) -> Non
     assert frame.conjugated == conjugated
     assert any("look conjugated" in one.text for one in frame_findings(frame)) == conjugated
     assert any("as it is mounted" in one.text for one in frame_findings(frame)) == (begin > 0.0)
-    again = trial_of(recording, frame, "a", 0.0)
+    again = resample_trial(recording, frame, "a", 0.0)
     away = again.angle_rad - trial.angle_rad[: len(again.angle_rad)]
     # A mount's own turn about the axis cannot be told from a bend; one that is taken off is the pose at rest.
     np.testing.assert_allclose(away, np.mean(away), atol=2e-3)
@@ -337,8 +342,8 @@ def test_poses_in_the_plane_give_the_same_trial(zero_rad: float) -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial, planar=True)
     columns["tip_phi_rad"] = np.remainder(columns["tip_phi_rad"] + zero_rad + np.pi, 2.0 * np.pi) - np.pi
-    recording = recording_of(_log(columns, trial), "a")
-    again = trial_of(recording, frame_of([recording]), "a", 0.0)
+    recording = read_recording(_log(columns, trial), "a")
+    again = resample_trial(recording, fit_frame([recording]), "a", 0.0)
     away = again.angle_rad - trial.angle_rad[: len(again.angle_rad)]
     np.testing.assert_allclose(away, np.mean(away), atol=2e-3)
     assert np.mean(away) == pytest.approx(-trial.begins[1] if zero_rad else 0.0, abs=0.04)
@@ -350,7 +355,7 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
     columns = columns_of(trial)
     columns["tip_qz"] = columns["tip_qz"].copy()
     columns["tip_qz"][700] += 0.02
-    recording = recording_of(_log(columns, trial), "a")
+    recording = read_recording(_log(columns, trial), "a")
     texts = [one.text for one in recording.findings]
     assert any("p2_kpa, p3_kpa never change" in text for text in texts)
     assert any("1 poses are left out" in text for text in texts)
@@ -363,7 +368,7 @@ def test_frozen_channels_and_jumps_are_findings() -> None:
 
 def _findings(columns: dict[str, FloatArray], trial: Trial) -> str:
     return "; ".join(
-        f"{one.severity}: {one.text}" for one in recording_of(_log(columns, trial), "a").findings
+        f"{one.severity}: {one.text}" for one in read_recording(_log(columns, trial), "a").findings
     )
 
 
@@ -424,11 +429,11 @@ def test_poses_that_were_not_seen_do_not_count() -> None:
     columns = columns_of(trial, planar=True)
     gone = np.abs(trial.t_s - 20.0) < 5.0
     columns["tip_phi_rad"] = np.where(gone, np.nan, columns["tip_phi_rad"])
-    recording = recording_of(_log(columns, trial), "a")
-    again = trial_of(recording, frame_of([recording]), "a", 0.0)
+    recording = read_recording(_log(columns, trial), "a")
+    again = resample_trial(recording, fit_frame([recording]), "a", 0.0)
     assert again.unseen is not None
     assert again.unseen.sum() == pytest.approx(gone.sum(), abs=2)
-    off = by_pressure(again, TRUE)["angle_rad"]
+    off = residuals_by_pressure(again, TRUE)["angle_rad"]
     assert len(off) == len(again.t_s) - again.unseen.sum()
     assert np.sqrt(np.mean(off**2)) < 5e-3
 
@@ -438,29 +443,29 @@ def test_an_arm_that_bends_to_negative_angles_is_the_same_arm() -> None:
     columns = columns_of(trial, planar=True)
     columns |= {"tip_phi_rad": -columns["tip_phi_rad"], "tip_x_m": 0.1 - columns["tip_x_m"]}
     columns |= {"base_x_m": np.full(len(trial.t_s), 0.1), "base_y_m": np.zeros(len(trial.t_s))}
-    recording = recording_of(_log(columns, trial), "a")
-    frame = frame_of([recording])
+    recording = read_recording(_log(columns, trial), "a")
+    frame = fit_frame([recording])
     assert [one.text for one in frame_findings(frame)] == [
         "tip_phi_rad falls as the arm bends; the angle is counted as it grows with bending"
     ]
-    again = trial_of(recording, frame, "a", 0.0)
+    again = resample_trial(recording, frame, "a", 0.0)
     np.testing.assert_allclose(again.angle_rad, trial.angle_rad[: len(again.angle_rad)], atol=2e-3)
     np.testing.assert_allclose(again.chord_m, trial.chord_m[: len(again.chord_m)], atol=2e-4)
     # A log that begins where the arm is bent most grows the same way.
     later = Log("a.csv", *_from(int(np.argmax(trial.angle_rad)), columns, trial))
-    assert frame_of([recording_of(later, "a")]).grows == -1.0
+    assert fit_frame([read_recording(later, "a")]).grows == -1.0
     # Beside poses that turn about some axis of their own it is the same arm too.
-    poses = recording_of(_log(columns_of(trial), trial), "b")
-    both = trial_of(recording, frame_of([poses, recording]), "a", 0.0)
+    poses = read_recording(_log(columns_of(trial), trial), "b")
+    both = resample_trial(recording, fit_frame([poses, recording]), "a", 0.0)
     np.testing.assert_allclose(both.angle_rad, again.angle_rad)
 
 
 def test_poses_about_another_axis_than_the_arms_are_refused() -> None:
     trial = simulated("a", 1)
-    right, conjugated = (recording_of(_log(columns_of(trial, one), trial), "a") for one in (False, True))
-    check_frame([right], frame_of([right]))
+    right, conjugated = (read_recording(_log(columns_of(trial, one), trial), "a") for one in (False, True))
+    check_frame([right], fit_frame([right]))
     with pytest.raises(BadInputError, match="turns about an axis 180 deg from that of the arm"):
-        check_frame([conjugated], frame_of([right]))
+        check_frame([conjugated], fit_frame([right]))
 
 
 @pytest.mark.slow
@@ -470,7 +475,7 @@ def test_an_arm_that_follows_its_pressure_closely_is_known_as_well() -> None:
     true = plain.values(np.zeros(len(PARAMETERS)), SCALE) | {"lag_s": 1.0, "bends_rad_per_kpa": 0.004}
     trials = [replace(simulated(f"a_{k}", k, values=true), command=np.zeros(0)) for k in range(3)]
     found = identify(trials, compare=False)
-    assert math.degrees(mean_of(found.held, "angle_by_pressure_rad")) < 0.3
+    assert math.degrees(mean_error(found.held, "angle_by_pressure_rad")) < 0.3
     assert found.fit.scale.finer == 10.0
     assert found.coverage > 0.9
     assert found.fit.values["bends_rad_per_kpa"] == pytest.approx(0.004, rel=0.03)
@@ -483,10 +488,12 @@ def test_a_trial_that_is_far_off_whatever_the_parts_outweighs_no_other(
 ) -> None:
     trials = [SimpleNamespace(name=name) for name in "abcd"]
     monkeypatch.setattr(
-        identification, "errors_of", lambda e, _: {"angle_by_pressure_rad": e, "angle_rad": e}
+        identification, "fit_errors", lambda e, _: {"angle_by_pressure_rad": e, "angle_rad": e}
     )
     plain, more = ({"a": 0.35} | dict.fromkeys("bcd", error) for error in (0.05, 0.02))
-    assert identification._error(trials, more) < 0.8 * identification._error(trials, plain)
+    assert identification._mean_held_error(trials, more) < 0.8 * identification._mean_held_error(
+        trials, plain
+    )
 
 
 @pytest.mark.slow
@@ -496,8 +503,8 @@ def test_an_arm_that_first_takes_up_slack_has_a_toe() -> None:
     trials = [simulated(f"a_{k}", k, values=values | {"toe_kpa": 200.0}) for k in range(3)]
     found = identify(trials, compare=False)
     assert "toe" in found.fit.assembly.parts
-    without = mean_of(found.others["without toe"], "angle_by_pressure_rad")
-    assert mean_of(found.held, "angle_by_pressure_rad") < 0.8 * without
+    without = mean_error(found.others["without toe"], "angle_by_pressure_rad")
+    assert mean_error(found.held, "angle_by_pressure_rad") < 0.8 * without
 
 
 @pytest.mark.slow
@@ -506,8 +513,8 @@ def test_a_regulator_that_follows_its_command_is_a_lag() -> None:
     true = follows.values(np.full(len(PARAMETERS), 0.3), SCALE)
     found = identify([simulated(f"a_{k}", k, values=true) for k in range(3)], compare=False)
     assert "lag" in found.fit.assembly.parts
-    by_valve = mean_of(found.others["a valve for the lag"], "angle_rad")
-    assert mean_of(found.held, "angle_rad") < 0.8 * by_valve
+    by_valve = mean_error(found.others["a valve for the lag"], "angle_rad")
+    assert mean_error(found.held, "angle_rad") < 0.8 * by_valve
 
 
 def test_units_that_no_arm_has_are_told() -> None:
@@ -515,15 +522,15 @@ def test_units_that_no_arm_has_are_told() -> None:
     columns = columns_of(trial)
     lengths = {name: 1e3 * columns[name] for name in columns if name.endswith("_m")}
     with pytest.raises(BadInputError, match="m apart, expected at most 3; columns"):
-        recording_of(_log(columns | lengths, trial), "a")
+        read_recording(_log(columns | lengths, trial), "a")
     degrees = columns_of(trial, planar=True)
     degrees["tip_phi_rad"] = np.degrees(degrees["tip_phi_rad"])
     with pytest.raises(BadInputError, match=r"tip_phi_rad reaches .* rad, expected at most 6\.28; columns"):
-        recording_of(_log(degrees, trial), "a")
+        read_recording(_log(degrees, trial), "a")
     for factor, words in ((1e3, "columns.yaml takes Pa"), (0.01, "kPa at most, as bar would")):
         pressures = {name: factor * columns[name] for name in columns if name.endswith("_kpa")}
         try:
-            said = [one.text for one in recording_of(_log(columns | pressures, trial), "a").findings]
+            said = [one.text for one in read_recording(_log(columns | pressures, trial), "a").findings]
         except BadInputError as error:
             said = [str(error)]
         assert any(words in text for text in said)
@@ -547,7 +554,7 @@ def test_poses_of_zeros_were_not_seen() -> None:
     for name in columns:
         if name.startswith("tip_"):
             columns[name][300:320] = 0.0
-    recording = recording_of(_log(columns, trial), "a")
+    recording = read_recording(_log(columns, trial), "a")
     assert recording.turned is not None
     assert np.flatnonzero(np.isnan(recording.turned[0]).any(axis=1)).tolist() == list(range(300, 320))
     assert "jumps" not in "; ".join(one.text for one in recording.findings)
@@ -563,7 +570,7 @@ def test_base_and_tip_that_are_swapped_are_told() -> None:
         for of, _, rest in [name.partition("_")]
         if of in other
     }
-    found = frame_findings(frame_of([recording_of(_log(columns | swapped, trial), "a")]))
+    found = frame_findings(fit_frame([read_recording(_log(columns | swapped, trial), "a")]))
     assert any("1.55 of the tip's angle, expected about half of it" in one.text for one in found)
 
 
@@ -573,7 +580,7 @@ def test_quaternions_in_another_order_are_told() -> None:
     for of in ("base", "tip"):
         w, x, y, z = (columns[f"{of}_q{k}"] for k in "wxyz")
         columns |= {f"{of}_q{k}": q for k, q in zip("wxyz", (x, y, z, w), strict=True)}
-    found = frame_findings(frame_of([recording_of(_log(columns, trial), "a")]))
+    found = frame_findings(fit_frame([read_recording(_log(columns, trial), "a")]))
     assert any("order of the quaternions" in one.advice for one in found)
 
 
@@ -581,11 +588,11 @@ def test_what_is_no_single_driven_arm_is_refused() -> None:
     trial = simulated("a", 1)
     both = columns_of(trial) | {"p_cmd2_kpa": trial.command}
     with pytest.raises(BadInputError, match=r"p_cmd1_kpa, p_cmd2_kpa change, expected one .* one is driven"):
-        recording_of(_log(both, trial), "a")
+        read_recording(_log(both, trial), "a")
     bad = columns_of(trial)
     bad["tip_qw"] = 2.0 * bad["tip_qw"]
     with pytest.raises(BadInputError, match=r"line 2: the quaternion tip_qw, \.\.\. has norm 1\.9"):
-        recording_of(_log(bad, trial), "a")
+        read_recording(_log(bad, trial), "a")
 
 
 def test_pressures_are_read_by_their_unit(tmp_path: Path) -> None:
@@ -610,12 +617,12 @@ def test_pressures_are_read_by_their_unit(tmp_path: Path) -> None:
 def test_held_trials_of_a_real_arm_are_predicted_better_than_by_arx(shared_data: Path) -> None:
     folder = shared_data / "softarm"
     names = ["1006_1", "1006_4", "1006_7", "1009_1", "1009_4"]
-    recordings = [recording_of(read_log(folder / f"{name}.csv"), name) for name in names]
-    frame = frame_of(recordings)
+    recordings = [read_recording(read_log(folder / f"{name}.csv"), name) for name in names]
+    frame = fit_frame(recordings)
     assert frame.conjugated
     assert 0.53 < frame.leans < 0.57
-    trials = [trial_of(r, frame, r.name[:4], 0.2 if r.name == "1009_4" else 0.0) for r in recordings]
+    trials = [resample_trial(r, frame, r.name[:4], 0.2 if r.name == "1009_4" else 0.0) for r in recordings]
     found = identify(trials, compare=False)
     for quantity in ("angle_rad", "chord_m", "angle_by_pressure_rad"):
-        mean, _ = gained(found, best_baseline(found, quantity), quantity)
+        mean, _ = gain_over_baseline(found, best_baseline(found, quantity), quantity)
         assert mean > 0.2, quantity

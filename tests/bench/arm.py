@@ -16,7 +16,7 @@ import _here  # noqa: F401
 import numpy as np
 from armtrials import SCALE, simulated
 
-from calib.stages.arm.identify import FULL, identify, mean_of
+from calib.stages.arm.identify import FULL, identify, mean_error
 from calib.stages.arm.model import PARAMETERS
 
 TRIALS, SPREAD = 4, 0.05
@@ -37,7 +37,7 @@ def main() -> None:
         ]
         found = identify(trials, compare=False)
         shares.append(found.coverage)
-        errors.append(math.degrees(mean_of(found.held, "angle_rad")))
+        errors.append(math.degrees(mean_error(found.held, "angle_rad")))
         print(
             f"set {seed}: held trials {errors[-1]:.2f} deg RMS, {100.0 * shares[-1]:.1f} % inside", flush=True
         )

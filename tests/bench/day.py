@@ -38,7 +38,7 @@ from calib.stages.estimator.read import rows_of, truth_of
 from calib.stages.estimator.replay import drive_for, estimator_for, opened
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 BLOCK_S = 600.0
 FIRST_BLOCKS = 40
@@ -56,7 +56,7 @@ def make_rig(path: Path) -> None:
 
 
 def _ten_minutes(imu_only: bool, truth: bool) -> Log:
-    log = log_of(run_scenario(make_scenario("ellipse"), SimulatedRig(), 0, "sensors", BLOCK_S))
+    log = run_log(run_scenario(make_scenario("ellipse"), SimulatedRig(), 0, "sensors", BLOCK_S))
     if not truth:
         log = replace(log, columns={k: v for k, v in log.columns.items() if k not in TRUE})
     if not imu_only:

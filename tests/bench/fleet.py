@@ -33,7 +33,7 @@ from calib.runner.outcomes import Answer, Outcome, opened_store
 from calib.runner.processes import local
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 PARTS = ("kill", "speed", "memory", "whole")
 
@@ -136,7 +136,7 @@ def whole(place: Path) -> None:
     (root / "logs").mkdir()
     for seed, (name, scenario, seconds) in enumerate((("static1", "static", 12.0), ("swing", "swing", 5.0))):
         moved = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
-        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(moved)))
+        (root / "logs" / f"{name}.csv").write_text(log_text(run_log(moved)))
     answer = calibrate_rig(RigSpec("whole", str(root)), FleetOptions(pages=True))
     run([*CALIB, "run", str(root), "-o", str(out)])
     told = answer.outcome

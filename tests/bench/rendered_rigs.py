@@ -58,7 +58,7 @@ from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import at_rest, make_scenario, run_scenario
 from calib.twin.scene import rotation
 from calib.twin.sensors import View
-from calib.twin.simulate import log_of, simulate
+from calib.twin.simulate import run_log, simulate
 
 RESTS = ("static1", "static2")
 ALIGNED = ("swing1", "swing2", "ellipse", "orientation")
@@ -147,7 +147,7 @@ def _log(
         told = run.pwm
         run = simulate(rig, at_rest(rig), played(told, PLAY * RANGE_PWM), len(told), seed)
         run = replace(run, pwm=told)
-    return log_text(log_of(run))
+    return log_text(run_log(run))
 
 
 def make(folder: Path, seed: int, off_mm: float, raised: bool, wrong: str | None, pictures: Path) -> None:

@@ -24,7 +24,7 @@ from calib.stages.actuator.pump import Orifice
 from calib.stages.estimator.driven import Drive
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import at_rest, make_scenario, run_scenario
-from calib.twin.simulate import log_of, simulate
+from calib.twin.simulate import run_log, simulate
 
 LIMIT = {"ellipse": 1.2 * 0.15, "step": 1.2 * 0.20, "elongation": 1.2 * 0.14}
 ESTIMATORS = ("kinematic", "driven", "handover", "smoothed")
@@ -53,7 +53,7 @@ def made(kind: str, name: str, seed: int) -> tuple[SimulatedRig, Log]:
         told = run.pwm
         run = simulate(rig, at_rest(rig), played(told, PLAY * RANGE_PWM), len(told), seed)
         run = replace(run, pwm=told)
-    return rig, log_of(run)
+    return rig, run_log(run)
 
 
 def main() -> None:

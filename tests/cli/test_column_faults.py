@@ -25,7 +25,7 @@ from calib.io.logs import Log, write_log
 from calib.stages.estimator.replay import replay_log
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 RIG = SimulatedRig()
 WIDTH, HEIGHT = RIG.view.camera.image_size_px
@@ -184,7 +184,7 @@ def _answer(verb: str, logs: list[Log], rig: Rig, folder: Path) -> Answer:
 def logs() -> dict[str, Log]:
     made = {}
     for seed, (name, (kind, options, span)) in enumerate(LOGS.items()):
-        made[name] = log_of(run_scenario(make_scenario(kind, options), RIG, seed, "truth", span), name)
+        made[name] = run_log(run_scenario(make_scenario(kind, options), RIG, seed, "truth", span), name)
     return made
 
 

@@ -17,7 +17,7 @@ from calib.core.arrays import FloatArray
 from calib.core.rig import Rig
 from calib.io.columns import STATES
 from calib.io.logs import Log, write_log
-from calib.stages.firmware.header import header_of
+from calib.stages.firmware.header import make_header
 from calib.twin.rig import SimulatedRig
 
 from .conftest import Run
@@ -100,7 +100,7 @@ def test_signs_that_are_turned_in_the_logs_are_told_to_the_board(
     rig.write_text(before + "geometry: {imu_sign: [1, -1, -1]}\n")
     done = calib("align", path, "--rig", rig)
     assert "the sign is turned" not in done.out
-    header = header_of(Rig.load(rig), "rig.yaml").values
+    header = make_header(Rig.load(rig), "rig.yaml").values
     assert [header[f"CALIB_IMU_SIGN_{axis}"] for axis in ("AX", "AY", "GZ")] == [1, -1, -1]
 
 

@@ -25,7 +25,7 @@ from calib.stages import stage
 from calib.stages.imu.tracks import missing
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 from .conftest import Run
 
@@ -50,7 +50,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     plan, paths = make_scenario("static"), []
     for seed in range(3):
         path = folder / f"static{seed}.csv"
-        path.write_text(log_text(log_of(run_scenario(plan, SimulatedRig(), seed, "truth", 20.0))))
+        path.write_text(log_text(run_log(run_scenario(plan, SimulatedRig(), seed, "truth", 20.0))))
         paths.append(path)
     return paths
 
@@ -251,7 +251,7 @@ def test_the_recording_of_imu_tk_with_figures(
 def moves(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of the simulated rig in motion."""
     path = tmp_path_factory.mktemp("moves") / "moves.csv"
-    path.write_text(log_text(log_of(run_scenario(make_scenario("chirp"), SimulatedRig(), 0, "truth", 20.0))))
+    path.write_text(log_text(run_log(run_scenario(make_scenario("chirp"), SimulatedRig(), 0, "truth", 20.0))))
     return path
 
 
@@ -419,7 +419,7 @@ def test_duplicates_a_short_gap_and_an_hour(calib: Run, arm: Arm, tmp_path: Path
 
 
 def test_a_truth_in_the_log_changes_no_gain(calib: Run, tmp_path: Path) -> None:
-    log = log_of(run_scenario(make_scenario("ellipse"), SimulatedRig(), 4, "truth", 12.0))
+    log = run_log(run_scenario(make_scenario("ellipse"), SimulatedRig(), 4, "truth", 12.0))
     kept = {name: values for name, values in log.columns.items() if not name.startswith("true_")}
     found = []
     for name, columns in (("with", log.columns), ("without", kept)):

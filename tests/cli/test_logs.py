@@ -26,8 +26,8 @@ from calib.core.rig import Rig
 from calib.io.columns import MEASURED
 from calib.io.logs import Log, read_log, write_log
 from calib.io.serial import Frame
-from calib.stages.firmware.conformance import reference_of
-from calib.stages.firmware.header import Header, header_of
+from calib.stages.firmware.conformance import make_reference
+from calib.stages.firmware.header import Header, make_header
 from calib.stages.firmware.vectors import vectors
 
 from .conftest import Run
@@ -205,7 +205,7 @@ serial = pytest.importorskip("serial")
 
 def _stream(header: Header, ticks: int = 90) -> bytes:
     identity, out = header.identity, b"\x00\xa5\x5a\x4ehalf a frame"
-    reference = reference_of(header.values)
+    reference = make_reference(header.values)
     for k, vector in enumerate(vectors(header.values, ticks)):
         # As a sketch of before, without the picture's age.
         inputs = replace(vector.given, late_ticks=0.0)
@@ -255,7 +255,7 @@ def board(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bytes], str]]:
 
 
 def test_a_board_is_recorded_and_checked(calib, rig: Path, tmp_path: Path, board) -> None:
-    header = header_of(Rig.load(rig), "rig.yaml")
+    header = make_header(Rig.load(rig), "rig.yaml")
     log = tmp_path / "log.csv"
     ended = calib("record", board(_stream(header)), "-o", log, "--ticks", "90", "--duration", "30s", "--json")
     assert ended.code == 0, ended.err
@@ -274,7 +274,7 @@ def test_a_board_is_recorded_and_checked(calib, rig: Path, tmp_path: Path, board
 
 
 def test_a_board_that_computes_something_else_fails(calib, rig: Path, tmp_path: Path, board) -> None:
-    header = header_of(Rig.load(rig), "rig.yaml")
+    header = make_header(Rig.load(rig), "rig.yaml")
     log = tmp_path / "log.csv"
     assert calib("record", board(_stream(header)), "-o", log, "--ticks", "90", "--duration", "30s").code == 0
     lines = log.read_text().splitlines()
@@ -290,7 +290,7 @@ def test_a_board_that_computes_something_else_fails(calib, rig: Path, tmp_path: 
 
 def test_a_board_that_falls_silent(calib, rig: Path, tmp_path: Path, board, monkeypatch) -> None:
     monkeypatch.setattr("calib.cli.record._FELL_SILENT_S", 0.3)
-    log, port = tmp_path / "log.csv", board(_stream(header_of(Rig.load(rig), "rig.yaml"), 30))
+    log, port = tmp_path / "log.csv", board(_stream(make_header(Rig.load(rig), "rig.yaml"), 30))
     ended = calib("record", port, "-o", log, "--duration", "20s")
     assert ended.code == 3 and "the board fell silent after" in ended.sentence
     assert len(read_log(log)) == 30

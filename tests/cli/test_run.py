@@ -22,7 +22,7 @@ from calib.io.logs import log_text
 from calib.runner.graph import HIDDEN
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Path
     (root / "logs").mkdir()
     for seed, (name, scenario, seconds) in enumerate((("static1", "static", 12.0), ("swing", "swing", 8.0))):
         made = run_scenario(make_scenario(scenario), SimulatedRig(), seed, "truth", seconds)
-        (root / "logs" / f"{name}.csv").write_text(log_text(log_of(made)))
+        (root / "logs" / f"{name}.csv").write_text(log_text(run_log(made)))
     return root
 
 

@@ -28,7 +28,7 @@ from calib.stages.control.laws import (
     step_back,
     wanted_motion,
 )
-from calib.stages.control.observer import Observer, design_observer, marker_jacobian, marker_of
+from calib.stages.control.observer import Observer, design_observer, marker_jacobian, marker_position
 from calib.stages.control.references import Ellipse
 from calib.stages.control.rig_model import (
     Model,
@@ -216,7 +216,7 @@ R = NOMINAL.plant.bellows_radius_m
 @given(q1=st.floats(0.05, 0.1), q2=st.floats(0.05, 0.1))
 def test_its_jacobian_by_differences(q1: float, q2: float) -> None:
     eps, q = 1e-6, np.array([q1, q2])
-    sides = [marker_of(q + e, R, 0.015) - marker_of(q - e, R, 0.015) for e in eps * np.eye(2)]
+    sides = [marker_position(q + e, R, 0.015) - marker_position(q - e, R, 0.015) for e in eps * np.eye(2)]
     assert np.stack(sides, axis=1) / (2 * eps) == pytest.approx(marker_jacobian(q, R, 0.015), abs=1e-6)
 
 
@@ -244,7 +244,7 @@ def _follow(
     observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
     for k, row in enumerate(pwm.tolist()):
         q, dq = truth[max(k - 2, 0), :2], truth[k, 2:4]
-        marker = marker_of(q, R, observer.marker_offset_m) + noise_m * rng.normal(size=2)
+        marker = marker_position(q, R, observer.marker_offset_m) + noise_m * rng.normal(size=2)
         if k % 50 == 49:
             marker += push
         rate = (dq[0] - dq[1]) / (2 * R) + bias + 0.003 * rng.normal()
@@ -290,7 +290,7 @@ def test_outliers_are_not_believed_and_a_lost_estimate_comes_back() -> None:
     dirty = np.array([s.y[:2] for s in _follow(pwm, truth, 1e-4, 0.0, push=0.02)])
     assert np.abs(clean - dirty).max() < 2e-4
     observer = design_observer(NOMINAL, latency_s=2.0 / 60.0)
-    x, y = marker_of(np.array([0.08, 0.08]), R, 0.015).tolist()
+    x, y = marker_position(np.array([0.08, 0.08]), R, 0.015).tolist()
     for _ in range(10):
         observer.correct((x, y), math.nan)
         assert observer.y[0] == pytest.approx(0.065)

@@ -20,7 +20,7 @@ from scipy.stats import norm
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.core.rig import Geometry, Rig
-from calib.io.logs import Log, unclipped
+from calib.io.logs import Log, blank_clipped
 from calib.stages.align.join import joined
 from calib.stages.align.plots import plots
 from calib.stages.align.read import align_log as read_for_alignment
@@ -397,7 +397,7 @@ def test_a_gyroscope_that_swings_beyond_its_range_is_read_within_it() -> None:
     nominal = SimulatedRig()
     trial = known(replace(nominal, imu=replace(nominal.imu, gyro_range_radps=math.radians(250.0))))
     logs = [twin_log(trial.rig, kind, settings, 20 + k) for k, (kind, settings) in enumerate(MOTIONS[:2])]
-    within = [unclipped(log) for log in logs]
+    within = [blank_clipped(log) for log in logs]
     assert within[0].passed.clipped > 20
     found = align([align_log(log) for log in within], prior_settings(trial.view))
     assert np.abs(scores(trial, found)).max() < 4.0

@@ -56,7 +56,7 @@ from calib.stages.estimator.read import drive_from_rig, periods
 from calib.stages.estimator.smoother import smooth
 from calib.stages.estimator.tuning import tuned_section
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 TARGET_MM = {"static": 0.04, "swing": 0.11, "ellipse": 0.05, "step": 0.06, "elongation": 0.07}
 """Means over the seeds below; an alignment as in `estimatorlogs.SIGMA` alone leaves 0.03 mm."""
@@ -237,7 +237,7 @@ def test_no_input_makes_it_say_nan(what: str) -> None:
 def test_a_head_at_rest_teaches_nothing_of_what_multiplies_its_motion() -> None:
     for seed in (4, 5):
         rig = varied_drive(seed)
-        log = log_of(run_scenario(make_scenario("static"), rig, seed, "sensors", 60.0))
+        log = run_log(run_scenario(make_scenario("static"), rig, seed, "sensors", 60.0))
         setup = setup_for(rig, seed)
         driven = DrivenFilter(setup, Drive())
         begin, _ = Drive().start(setup)

@@ -54,7 +54,7 @@ from calib.stages.estimator.smoother import Events, OneLevel, events_of, forward
 from calib.twin.rig import SimulatedRig, nominal_view
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import HeadMotion, Imu, ImuNoise, Tracker, marker_pixels, measure
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 TARGET_MM = {"static": 0.08, "swing": 0.22, "ellipse": 0.19, "step": 0.22, "elongation": 0.18}
 TARGET_DEG = {"swing": 0.06}
@@ -458,7 +458,7 @@ def test_a_level_that_leaves_the_model_goes_on_with_what_the_alignment_says() ->
         nominal.view.camera, image_size_px=(640, 480), fx_px=560.0, fy_px=560.0, cx_px=320.0, cy_px=240.0
     )
     rig = replace(nominal, plant=plant, view=replace(nominal.view, camera=camera))
-    log = log_of(run_scenario(make_scenario("swing"), rig, 1, "sensors"))
+    log = run_log(run_scenario(make_scenario("swing"), rig, 1, "sensors"))
     setup = setup_for(rig)
     head = setup.start.head.copy()
     head[1] = plant.rest_length_m
@@ -487,7 +487,7 @@ def test_stamps_that_jitter_by_a_fifth_of_a_period_count_no_sample_that_was_not_
 def test_jitter_is_recovered_from_whole_pixels(jitter: float) -> None:
     nominal = SimulatedRig()
     rig = replace(nominal, tracker=replace(nominal.tracker, jitter_px=jitter))
-    log = log_of(run_scenario(make_scenario("ellipse"), rig, 3, "sensors", 12.0))
+    log = run_log(run_scenario(make_scenario("ellipse"), rig, 3, "sensors", 12.0))
     found = jitter_px(setup_for(nominal), [rows_from(log)])
     assert found.sigma is not None and found.sigma < 0.15
     assert abs(np.log(found.value / jitter)) < max(4.0 * found.sigma, 0.12)

@@ -17,7 +17,7 @@ from calib.stages.estimator.read import periods
 from calib.stages.estimator.replay import smooth_log
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.twin.scenarios import make_scenario, run_scenario
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 
 @pytest.mark.few(2)
@@ -96,7 +96,7 @@ def test_where_the_filter_begins_again_the_smoother_does() -> None:
     rig = varied(2)
     light = replace(rig.plant, mass_kg=0.6 * rig.plant.mass_kg, inertia_kgm2=0.6 * rig.plant.inertia_kgm2)
     rig = replace(rig, plant=light, imu=replace(rig.imu, rate_hz=50.0))
-    log = log_of(run_scenario(make_scenario("swing", {"phi_rad": "0.45"}), rig, 2, "sensors"))
+    log = run_log(run_scenario(make_scenario("swing", {"phi_rad": "0.45"}), rig, 2, "sensors"))
     rows = rows_from(log)
     kept = np.ones(len(rows), dtype=np.bool_)
     kept[np.flatnonzero(rows.kinds & 1)[1::2]] = False
@@ -110,7 +110,7 @@ def test_where_the_filter_begins_again_the_smoother_does() -> None:
 def test_pumps_that_fill_at_once_do_not_lose_the_head() -> None:
     rig = varied(2)
     rig = replace(rig, pump=replace(rig.pump, lag_s=0.1))
-    log = log_of(run_scenario(make_scenario("steps"), rig, 2, "sensors", 18.0))
+    log = run_log(run_scenario(make_scenario("steps"), rig, 2, "sensors", 18.0))
     setup, rows = setup_for(rig, 2), rows_from(log)
     setup = replace(setup, process=setup.process.beside(hand=False))
     filtered = Filter(setup).run(rows)

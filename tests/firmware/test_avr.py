@@ -33,8 +33,8 @@ from calib.core.rig import Rig
 from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.actuator.simulate import rig_at_rest
 from calib.stages.control.references import Ellipse
-from calib.stages.firmware.conformance import reference_of
-from calib.stages.firmware.header import header_of, verbatim
+from calib.stages.firmware.conformance import make_reference
+from calib.stages.firmware.header import make_header, verbatim
 from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused
 from calib.twin.rig import SimulatedRig
 from calib.twin.simulate import Seen, simulate
@@ -147,11 +147,11 @@ def test_the_budget_of_the_thesis_tick(tmp_path: Path) -> None:
     command, _ = avr(tmp_path, "-DCALIB_UNDISTORT=0", "-DCALIB_MOVING")
     assert _told("aligned rig, moving reference", run(command, _thesis_ticks(moving)).extra) <= budget(19_500)
     section = rig("levelling").orientation_filter
-    write(tmp_path, header_of(rig("twin").with_sections({"orientation_filter": section}), "rig.yaml"))
+    write(tmp_path, make_header(rig("twin").with_sections({"orientation_filter": section}), "rig.yaml"))
     command, _ = avr(tmp_path, "-DCALIB_UNDISTORT=0")
     assert _told("levelling, constant reference", run(command, _thesis_ticks(still)).extra) <= budget(17_500)
     integral = _with_integral(rig())
-    write(tmp_path, header_of(integral, "rig.yaml"))
+    write(tmp_path, make_header(integral, "rig.yaml"))
     command, sizes = avr(tmp_path, "-DCALIB_UNDISTORT=0")
     cycles = run(command, _thesis_ticks(still)).extra
     assert _told("constant reference, integral part as well", cycles) <= budget(15_500)
@@ -272,7 +272,7 @@ def test_the_loop_closed_by_the_processor_is_that_of_float64(
     write(tmp_path, header(kind))
     switch = ["-DCALIB_FUSED=1"] if fused else []
     wanted, mode = experiment(name)
-    reference = reference_of(header(kind).values, fused=fused)
+    reference = make_reference(header(kind).values, fused=fused)
     expected = closed(lambda given: reference.step(given).pwm, wanted, mode)
     if where == "avr":
         found = closed(_avr(avr(tmp_path, *switch)[0]), wanted, mode)

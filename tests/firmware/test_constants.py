@@ -29,7 +29,14 @@ from calib.stages.estimator.kinematic import Setup, Start
 from calib.stages.estimator.sensors import sensor_values, view_coefficients
 from calib.stages.firmware.conformance import Reference
 from calib.stages.firmware.constants import PlaneConstants, plane_constants
-from calib.stages.firmware.header import VERBATIM, comment_text, float_literal, header_of, literals, verbatim
+from calib.stages.firmware.header import (
+    VERBATIM,
+    comment_text,
+    float_literal,
+    literals,
+    make_header,
+    verbatim,
+)
 from calib.twin.pictures import CAMERA, PLANE
 
 HOSTILE = {"*/ int x; /*": "1", "??/\n#error": "2", 'quote".png': "3", "ünï\u202e.png": "4", "\\": "5"}
@@ -74,7 +81,7 @@ def test_the_frames_compile_as_c(tmp_path: Path, compiler: str, flags: str) -> N
 
 
 def test_same_rig_same_bytes() -> None:
-    again = header_of(copy.deepcopy(rig()), "elsewhere/rig.yaml")
+    again = make_header(copy.deepcopy(rig()), "elsewhere/rig.yaml")
     assert again.text == header().text
     assert again.digest == header().digest
 
@@ -87,7 +94,7 @@ def test_every_constant_compiles_to_numpys_bits(
 ) -> None:
     whole = copy.deepcopy(rig("full"))
     whole.provenance.inputs["camera"] = HOSTILE
-    made = header_of(whole, "rig.yaml")
+    made = make_header(whole, "rig.yaml")
     write(tmp_path, made)
     floats = {n: v for n, v in made.literals.items() if v.endswith("f")}
     body = ",\n".join(name for name in floats if "[" not in name)
@@ -194,7 +201,7 @@ def test_constants_that_may_not_drive_a_rig_do_not_compile_for_a_board(tmp_path:
     }
     board = "" if compiler == "avr-gcc" else " -DARDUINO=10819"
     for kind, whole in kinds.items():
-        write(tmp_path, header_of(whole, "rig.yaml"))
+        write(tmp_path, make_header(whole, "rig.yaml"))
         for known in (False, True):
             flags = f"-std=c99{board}{' -DCALIB_I_KNOW=1' if known else ''}"
             done = _compiled(tmp_path, compiler, flags, '#include "calib_guard.h"\n')
@@ -272,7 +279,7 @@ def test_both_ways_through_the_plane_find_the_world() -> None:
 
 def test_a_fisheye_lens_is_undone_over_the_workspace() -> None:
     """By the header's polynomial alone, to a hundredth of a pixel of the ideal picture."""
-    made, section = header_of(rig("fisheye"), "rig.yaml"), rig("fisheye").camera
+    made, section = make_header(rig("fisheye"), "rig.yaml"), rig("fisheye").camera
     assert section is not None
     assert made.verdict.word == "ok", made.verdict.reasons
     reference = Reference(made.values)
@@ -383,9 +390,9 @@ _IMU = {
 
 def test_gains_for_an_imu_that_nobody_has_measured_are_poor() -> None:
     whole = rig("full")
-    assert "neither imu nor align" not in str(header_of(whole, "rig.yaml").verdict.reasons)
+    assert "neither imu nor align" not in str(make_header(whole, "rig.yaml").verdict.reasons)
     bare = whole.only([name for name in whole.sections if name not in ("imu", "align", "estimator")])
-    assert "neither imu nor align" in str(header_of(bare, "rig.yaml").verdict.reasons)
+    assert "neither imu nor align" in str(make_header(bare, "rig.yaml").verdict.reasons)
 
 
 @pytest.mark.parametrize(
@@ -395,7 +402,7 @@ def test_an_imu_that_is_turned_and_not_aligned_is_poor(accel_mps2: list[float], 
     whole = rig("full")
     imu = Rig.of({"imu": {**_IMU, "accel_mean_mps2": [*accel_mps2, 0.0]}}, "rig.yaml").imu
     bare = whole.only([name for name in whole.sections if name not in ("align", "estimator")])
-    reasons = header_of(bare.with_sections({"imu": imu}), "rig.yaml").verdict.reasons
+    reasons = make_header(bare.with_sections({"imu": imu}), "rig.yaml").verdict.reasons
     assert ("which the board takes for bending" in str(reasons)) is told
 
 
@@ -403,8 +410,8 @@ def test_a_section_that_was_taken_away_is_missed() -> None:
     """Its defaults are of another rig than the gains."""
     inputs = {"controller": {"actuator": "", "align": "1" * 64}}
     whole = rig("full").with_sections({"provenance": Provenance(inputs=inputs)})
-    assert "not there" not in str(header_of(whole, "rig.yaml").verdict.reasons)
-    reasons = header_of(whole.with_sections({"align": None}), "rig.yaml").verdict.reasons
+    assert "not there" not in str(make_header(whole, "rig.yaml").verdict.reasons)
+    reasons = make_header(whole.with_sections({"align": None}), "rig.yaml").verdict.reasons
     assert "align, with which controller was computed, is not there: the header has defaults" in reasons
 
 
@@ -413,13 +420,13 @@ def test_a_camera_slower_than_the_tick_is_poor() -> None:
     one = LogCheck(name="a.csv", duration_s=9.0, stretches=1, pictures=500, outliers=0, samples=900)
     for rate_hz, told in ((60.1, False), (50.0, False), (30.0, True)):
         seen = [one.model_copy(update={"camera_rate_hz": rate_hz})]
-        reasons = str(header_of(_with("align", logs=seen), "rig.yaml").verdict.reasons)
+        reasons = str(make_header(_with("align", logs=seen), "rig.yaml").verdict.reasons)
         assert ("takes a tick without a picture for a lost marker" in reasons) is told
 
 
 @pytest.mark.parametrize(("offset_s", "ticks"), [(0.0255, 1.53), (0.0, 0.0), (0.1, 6.0), (-0.008, 0.0)])
 def test_the_delay_of_the_pictures_is_honoured_to_parts_of_a_tick(offset_s: float, ticks: float) -> None:
-    made = header_of(_with("align", time_offset_s=offset_s), "rig.yaml")
+    made = make_header(_with("align", time_offset_s=offset_s), "rig.yaml")
     c = made.values
     assert c["CALIB_TIME_OFFSET_TICKS"] - c["CALIB_TIME_OFFSET_PART"] == pytest.approx(ticks, abs=1e-6)
     assert c["CALIB_FUSED_DELAY_TICKS"] == pytest.approx(ticks, abs=1e-6)
@@ -430,15 +437,15 @@ def test_pictures_from_before_or_long_after_the_sample_are_refused() -> None:
     for offset_s, advice in ((-0.02, "by one clock"), (0.15, r"calib lowpass --rate 53Hz$")):
         match = rf"align\.time_offset_s is .* expected pictures that are -1 to 8.*{advice}"
         with pytest.raises(BadInputError, match=match):
-            header_of(_with("align", time_offset_s=offset_s), "rig.yaml")
+            make_header(_with("align", time_offset_s=offset_s), "rig.yaml")
     with pytest.raises(BadInputError, match=r"to 8 ticks late; align is unidentifiable, so that its numbers"):
-        header_of(_with("align", time_offset_s=0.15, word_="unidentifiable"), "rig.yaml")
+        make_header(_with("align", time_offset_s=0.15, word_="unidentifiable"), "rig.yaml")
 
 
 @pytest.mark.parametrize("alpha", [0.0, 0.05, -1.2, 2.5])
 def test_the_accelerometers_map_undoes_bias_scale_and_mount(alpha: float) -> None:
     whole = _with("align", mount_angle_rad=alpha, accel_scale=[0.01, -0.02], accel_bias_mps2=[0.2, -0.1])
-    c = header_of(whole, "rig.yaml").values
+    c = make_header(whole, "rig.yaml").values
     phi = 0.4
     force = 9.81 * np.array([math.cos(phi + alpha), math.sin(phi + alpha)])
     reading = force * np.array([1.01, 0.98]) + np.array([0.2, -0.1])
@@ -456,7 +463,7 @@ def test_without_tuned_gains_they_are_for_the_noise_of_the_alignment() -> None:
     """As `calib.stages.estimator.constant_gain` finds it from the set-up, to second order in the angle."""
     whole = _with("align", jitter_px=0.3, imu_lever_m=0.006)
     whole = whole.with_sections({"estimator": None})
-    made = header_of(whole, "rig.yaml")
+    made = make_header(whole, "rig.yaml")
     c = made.values
     assert " * Gains for the noise in align.\n" in made.text
     assert " * Gains of estimator.constant_gain.\n" in header("fused").text
@@ -514,7 +521,7 @@ def test_the_state_variable_form_is_the_section() -> None:
 
 
 def test_the_bias_of_the_imu_at_rest_is_used_without_align() -> None:
-    c = header_of(Rig.of({"imu": _IMU}, "rig.yaml"), "rig.yaml").values
+    c = make_header(Rig.of({"imu": _IMU}, "rig.yaml"), "rig.yaml").values
     assert c["CALIB_IMU_GYRO_BIAS_RADPS"] == pytest.approx(0.021)
     assert c["CALIB_MM_GYRO_BIAS_DT_RAD"] == pytest.approx(0.021 / 60.0)
     assert "imu.gyro_bias_radps" in header().text

@@ -19,7 +19,7 @@ from calib.io.serial import FAULTS as FAULT_WORDS
 from calib.io.serial import GUARD_FAULT, GUARD_RUN, MODE_POSITION, Decoder, Frame, Inputs
 from calib.stages.firmware.check import check_frames
 from calib.stages.firmware.conformance import binary32
-from calib.stages.firmware.header import header_of, verbatim
+from calib.stages.firmware.header import make_header, verbatim
 from calib.stages.firmware.vectors import coherent
 from calib.twin.pictures import CAMERA, PLANE
 
@@ -263,7 +263,7 @@ def test_the_self_test_passes_in_any_envelope(
     whole = Rig.of({"envelope": envelope}, "rig.yaml").with_sections(
         {"controller": tuned.model_copy(update={"pwm_low": 0.0, "pwm_high": float(high_pwm)})}
     )
-    made_of = header_of(whole, "rig.yaml")
+    made_of = make_header(whole, "rig.yaml")
     assert made_of.values["CALIB_ENVELOPE_OPEN_HIGH"] <= made_of.values["CALIB_PUMP_HIGH"] == high_pwm
     write(tmp_path, made_of)
     assert selftest(tmp_path, "guard")
@@ -271,7 +271,7 @@ def test_the_self_test_passes_in_any_envelope(
 
 def test_a_slow_pump_may_fill_its_bellows_at_full_power() -> None:
     def full_s(sections: dict[str, dict[str, object]]) -> float:
-        made = header_of(Rig.of(sections, "rig.yaml"), "rig.yaml").values
+        made = make_header(Rig.of(sections, "rig.yaml"), "rig.yaml").values
         return made["CALIB_ENVELOPE_FULL_TICKS"] / made["CALIB_TICK_RATE_HZ"]
 
     slow, fast = ({"pump": {"verdict": "ok", "lag_s": lag_s}} for lag_s in (2.0, 0.7))
@@ -308,7 +308,7 @@ def test_a_swing_before_a_slow_camera_is_no_other_thing(tmp_path: Path) -> None:
     whole = rig("fused")
     assert whole.align is not None
     late = whole.align.model_copy(update={"time_offset_s": 8.0 / 60.0})
-    made = header_of(whole.with_sections({"align": late}), "rig.yaml")
+    made = make_header(whole.with_sections({"align": late}), "rig.yaml")
     write(tmp_path, made)
     ticks = coherent(made.values, 480, lateness=lambda _: 0.0)
     given = [binary32(replace(one, reference=(0.07, 0.07), mode=MODE_POSITION)) for one in ticks]

@@ -15,7 +15,7 @@ from firmware_rigs import header, rig
 from calib.io.serial import MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.firmware.conformance import FusedReference, Reference
 from calib.stages.firmware.header import float_literal, values
-from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused, pixel_of
+from calib.stages.firmware.vectors import binary32, coherent, directed, directed_fused, find_pixel
 
 # Not reached by any marker inside the picture; test_pipeline.py has a plane whose horizon is.
 UNREACHED = {"CALIB_PLANE_LEAST_PER_M", "CALIB_PLANE_RAW_LEAST_PER_M"}
@@ -125,7 +125,7 @@ def _stimulus_fused(constants: dict[str, float]) -> list[Inputs]:
     Y = c["REST_LENGTH_M"] + c["MARKER_OFFSET_M"]
 
     def along(by_m: float) -> Inputs:
-        u, v = pixel_of(reference, 0.0, Y + by_m)
+        u, v = find_pixel(reference, 0.0, Y + by_m)
         return replace(still, u_px=u, v_px=v)
 
     creep = 0.85 * c["FUSED_REST_LENGTH"] * c["FUSED_MOVING_M"]

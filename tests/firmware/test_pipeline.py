@@ -36,7 +36,7 @@ from calib.stages.firmware.conformance import (
     FusedReference,
     Reference,
 )
-from calib.stages.firmware.header import Header, header_of
+from calib.stages.firmware.header import Header, make_header
 from calib.stages.firmware.vectors import (
     FUSED_TICKS,
     PERIOD,
@@ -215,7 +215,7 @@ def test_the_self_test_passes_at_other_ticks(tmp_path: Path, rate_hz: float) -> 
     """At 15 Hz and below the head turned on beyond what a float follows, and the fused board never ran."""
     whole = rig("twin")
     whole = whole.with_sections({"lowpass": calib.lowpass(whole, rate_hz=rate_hz)})
-    write(tmp_path, header_of(whole, "rig.yaml"))
+    write(tmp_path, make_header(whole, "rig.yaml"))
     for fused in (0, 1):
         assert selftest(tmp_path, "selftest", f"-DCALIB_FUSED={fused}")
 
@@ -251,7 +251,7 @@ def test_low_passes_of_every_order(tmp_path: Path, order: int) -> None:
     rows = design_lowpass(Design(3.0, 60.0, order)).sections.tolist()
     sections = [LowPassSection(b=row[:3], a=row[3:]) for row in rows]
     other = section.model_copy(update={"order": order, "cutoff_hz": 3.0, "sections": sections})
-    made = header_of(rig().with_sections({"lowpass": other}), "rig.yaml")
+    made = make_header(rig().with_sections({"lowpass": other}), "rig.yaml")
     write(tmp_path, made)
     Made(made, False, host(tmp_path)).check(directed(made.values, 1500))
 

@@ -35,7 +35,7 @@ from calib.io.experiments import (
 )
 from calib.io.logs import read_log
 from calib.io.serial import ALIVE, CLEAR, GUARD_FAULT, GUARD_RUN, Decoder, Frame, ImuSample, setting
-from calib.stages.firmware.header import header_of
+from calib.stages.firmware.header import make_header
 
 SILENT_MS = 284.0
 """A lost computer stops the pumps within this: CALIB_LINK_SILENT_MS, up to a tick until a frame is read,
@@ -45,7 +45,7 @@ and up to one until the silence is seen; 273 ms at most of the moments tried. Th
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Built:
     """The sketch for a rig of which nothing is known yet."""
-    return sketch(tmp_path_factory.mktemp("bare"), "OFF", made=header_of(Rig(), "rig.yaml"))
+    return sketch(tmp_path_factory.mktemp("bare"), "OFF", made=make_header(Rig(), "rig.yaml"))
 
 
 def _do(
@@ -130,7 +130,7 @@ def test_a_computer_that_is_cut_off_stops_the_pumps(bare: Built, tmp_path: Path,
 
 def test_the_guard_holds_open_loop_to_the_envelope(tmp_path: Path) -> None:
     narrow = Rig.of({"envelope": {"angle_rad": 0.08}}, "rig.yaml")
-    board = sketch(tmp_path, "OFF", made=header_of(narrow, "rig.yaml"))
+    board = sketch(tmp_path, "OFF", made=make_header(narrow, "rig.yaml"))
     simulated = SimulatedBoard(board)
     sides = replace(EXPERIMENTS["ellipse"], seconds=8.0)
     with pytest.raises(
@@ -145,7 +145,7 @@ def test_the_guard_holds_open_loop_to_the_envelope(tmp_path: Path) -> None:
 
 def test_a_command_beyond_the_envelope_drives_nothing(tmp_path: Path) -> None:
     low = Rig.of({"envelope": {"open_loop_pwm": 100.0, "open_loop_s": 1.0}}, "rig.yaml")
-    simulated = SimulatedBoard(sketch(tmp_path, "OFF", made=header_of(low, "rig.yaml")))
+    simulated = SimulatedBoard(sketch(tmp_path, "OFF", made=make_header(low, "rig.yaml")))
     board = Board(simulated, "board")
     assert board.hello.open_high == 100
     board.pumps((101, 0))

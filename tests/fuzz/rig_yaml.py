@@ -110,11 +110,11 @@ def _difference(path: Path) -> None:
 
 def _constants(path: Path) -> None:
     from calib.core.rig import Rig
-    from calib.stages.firmware.header import header_of
+    from calib.stages.firmware.header import make_header
 
     whole = Rig.load(path)
     if whole.camera is not None:
-        text = header_of(whole, "rig.yaml").text
+        text = make_header(whole, "rig.yaml").text
         assert text.isascii() or text.isprintable
 
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from calib.core.errors import BadInputError
 from calib.core.options import LogOptions
 from calib.io import unpacking
-from calib.io.bag_topics import Field, Topic, TopicMap, reader_of, topic_map
+from calib.io.bag_topics import Field, Topic, TopicMap, field_reader, topic_map
 from calib.io.bags import WINDOW_S, rows_from_messages
 from calib.io.logs import iter_log, read_log
 from calib.io.unpacking import BoundedFile, BoundedPath
@@ -371,7 +371,7 @@ json_values = st.recursive(
 @given(json_values, st.sampled_from(["a", "a.b", "a[0]", "a[1].b", "b.a[0][1]"]))
 def test_any_message_gives_a_number_or_a_sentence(message: object, path: str) -> None:
     try:
-        value = reader_of("log", "/t", Field("u_px", path))(message)
+        value = field_reader("log", "/t", Field("u_px", path))(message)
     except BadInputError as error:
         assert "\n" not in str(error)
     else:
@@ -379,11 +379,11 @@ def test_any_message_gives_a_number_or_a_sentence(message: object, path: str) ->
 
 
 def test_nothing_that_was_detected_is_a_blank() -> None:
-    read = reader_of("log", "/t", Field("u_px", "detections[0].x"))
+    read = field_reader("log", "/t", Field("u_px", "detections[0].x"))
     assert math.isnan(read({"detections": []}))
     assert read({"detections": [{"x": 7}]}) == 7.0
     with pytest.raises(BadInputError, match="1 elements there"):
-        reader_of("log", "/t", Field("u_px", "data[1]"))({"data": [7]})
+        field_reader("log", "/t", Field("u_px", "data[1]"))({"data": [7]})
 
 
 MOST = 100_000

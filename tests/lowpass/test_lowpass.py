@@ -46,12 +46,12 @@ from calib.stages.lowpass.filters import (
     prototype,
     rest_error_binary32,
 )
-from calib.stages.lowpass.jitter import jitter_after, on_ticks, spectrum, suggest
+from calib.stages.lowpass.jitter import jitter_after, resample_to_ticks, spectrum, suggest
 from calib.stages.lowpass.stage import positions_from_log, solve
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import marker_pixels
-from calib.twin.simulate import log_of
+from calib.twin.simulate import run_log
 
 FREQUENCIES = np.array([0.0, 0.1, 0.7, 1.0, 3.0, 11.0, 29.0])
 
@@ -236,7 +236,7 @@ def test_coloured_jitter_above_the_motion_counts_as_it_is() -> None:
 def test_the_simulated_rigs_jitter_is_found_in_motion(name: str) -> None:
     rig = SimulatedRig()
     run = run_scenario(make_scenario(name), rig, 1, "sensors", 30.0 if name == "ellipse" else None)
-    log = log_of(run)
+    log = run_log(run)
     rows = log.sampled("u_px", "v_px")
     seen = np.stack([log.columns["u_px"][rows], log.columns["v_px"][rows]], axis=1)
     q = run.trajectory.at(run.sensors.tracker.exposed_s)[:, :2]
@@ -244,7 +244,7 @@ def test_the_simulated_rigs_jitter_is_found_in_motion(name: str) -> None:
     for axis in (0, 1):
         one = noise[:, axis][~np.isnan(noise[:, axis])]
         calm = np.where(np.abs(one) < 3.0, one, 0.0)
-        found = spectrum(on_ticks(log.t_s[rows], seen, 60.0).longest.values[:, axis], 60.0)
+        found = spectrum(resample_to_ticks(log.t_s[rows], seen, 60.0).longest.values[:, axis], 60.0)
         # Between the jitter without outliers and that with all of them; a floor of few segments to 15 %.
         low, high = (filter_signal(FIRST, value)[60:].std() for value in (calm, one))
         assert 0.85 * low < jitter_after(found, FIRST) < 1.15 * high
@@ -292,7 +292,7 @@ X = np.stack([np.arange(600.0), -np.arange(600.0)], axis=1)
 
 def test_jittered_stamps_change_nothing() -> None:
     t = T_TICKS + np.random.default_rng(0).uniform(-0.3, 0.3, 600) / 60.0
-    ticks = on_ticks(np.sort(t), X, 60.0)
+    ticks = resample_to_ticks(np.sort(t), X, 60.0)
     assert len(ticks.pieces) == 1
     assert np.array_equal(ticks.longest.values, X)
     assert (ticks.held, ticks.dropped) == (0, 0)
@@ -301,7 +301,7 @@ def test_jittered_stamps_change_nothing() -> None:
 def test_of_duplicates_the_last_counts() -> None:
     rows = np.sort(np.append(np.arange(600), [50, 50, 599]))
     values = np.arange(603.0)[:, None]
-    ticks = on_ticks(T_TICKS[rows], values, 60.0)
+    ticks = resample_to_ticks(T_TICKS[rows], values, 60.0)
     assert ticks.dropped == 3
     assert len(ticks.longest.values) == 600
     assert ticks.longest.values[50, 0] == 52.0
@@ -310,11 +310,11 @@ def test_of_duplicates_the_last_counts() -> None:
 
 def test_a_long_gap_splits_and_a_short_one_does_not() -> None:
     t = np.concatenate([T_TICKS[:200], T_TICKS[200:] + 3600.0])
-    ticks = on_ticks(t, X, 60.0)
+    ticks = resample_to_ticks(t, X, 60.0)
     assert [len(piece.t_s) for piece in ticks.pieces] == [200, 400]
     assert ticks.longest.t_s[0] == pytest.approx(3600.0 + 200 / 60.0)
     assert ticks.held == 0
-    assert len(on_ticks(np.concatenate([T_TICKS[:200], T_TICKS[200:] + 0.5]), X, 60.0).pieces) == 1
+    assert len(resample_to_ticks(np.concatenate([T_TICKS[:200], T_TICKS[200:] + 0.5]), X, 60.0).pieces) == 1
 
 
 WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
@@ -323,7 +323,7 @@ WORKSPACE = (-0.06, 0.04, 0.06, 0.11)
 def test_positions_are_the_markers_on_the_plane(tmp_path: Path) -> None:
     rig = SimulatedRig()
     run = run_scenario(make_scenario("ellipse"), rig, 2, "sensors", 8.0)
-    log = log_of(run)
+    log = run_log(run)
     write_log(tmp_path / "log.csv", log)
     seen = positions_from_log(
         read_log(tmp_path / "log.csv"),
@@ -343,7 +343,7 @@ def test_positions_are_the_markers_on_the_plane(tmp_path: Path) -> None:
 def test_without_a_rate_the_filter_has_that_of_the_logs_camera(tmp_path: Path) -> None:
     run = run_scenario(make_scenario("ellipse"), SimulatedRig(), 2, "sensors", 8.0)
     for every, rate_hz in ((1, 60.0), (2, 30.0)):
-        log = log_of(run)
+        log = run_log(run)
         dropped = np.rint(60.0 * log.t_s).astype(int) % every > 0
         for name in ("u_px", "v_px"):
             log.columns[name][dropped] = np.nan

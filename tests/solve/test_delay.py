@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.solve.delay import clocks, delay_of, moments, shares, vertex
+from calib.solve.delay import clocks, estimate_delay, moments, shares, vertex
 
 
 def _motion(t: np.ndarray) -> np.ndarray:
@@ -17,7 +17,7 @@ def test_finds_the_delay(delay: float) -> None:
     rng = np.random.default_rng(1)
     t, seen = 0.01 * np.arange(2000), np.arange(0.0, 20.0, 1.0 / 60.0)
     late = _motion(seen - delay) + 0.4 + 0.003 * rng.normal(size=len(seen))
-    found = delay_of(seen, late, t, _motion(t), _motion(t) + 0.01 * t)
+    found = estimate_delay(seen, late, t, _motion(t), _motion(t) + 0.01 * t)
     assert found == pytest.approx(delay, abs=1e-3)
 
 

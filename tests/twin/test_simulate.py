@@ -17,7 +17,7 @@ from calib.stages.control.laws import Channel, Pid, saturate
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import SCENARIOS, Figures, make_scenario, run_scenario
 from calib.twin.sensors import Imu, Tracker, marker_pixels
-from calib.twin.simulate import Law, Run, Seen, log_of, simulate
+from calib.twin.simulate import Law, Run, Seen, run_log, simulate
 
 RIG = SimulatedRig()
 PERFECT = replace(
@@ -110,7 +110,7 @@ def test_frames_show_the_past_and_samples_the_present() -> None:
 
 
 def test_the_log_has_rows_of_ticks_and_of_samples_in_the_order_of_time() -> None:
-    log = log_of(_run(_commands(600), 600, PERFECT))
+    log = run_log(_run(_commands(600), 600, PERFECT))
     assert len(log) == 600 + 1000
     assert np.all(np.diff(log.t_s) >= 0.0)
     ticks, samples = log.sampled("pwm1", "pwm2"), log.sampled("ax_mps2", "gz_radps")
@@ -123,7 +123,7 @@ def test_the_log_has_rows_of_ticks_and_of_samples_in_the_order_of_time() -> None
 
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
-    texts = [log_text(log_of(_run(_commands(120), 120, seed=seed))) for seed in (3, 3, 4)]
+    texts = [log_text(run_log(_run(_commands(120), 120, seed=seed))) for seed in (3, 3, 4)]
     assert texts[0] == texts[1] != texts[2]
 
 
@@ -247,7 +247,7 @@ def test_every_scenario_gives_a_log_of_the_length_asked_for(name: str) -> None:
     for duration_s in (0.05, 1.0):
         run, _ = _do(name, duration_s)
         assert len(run.pwm) == round(60.0 * duration_s)
-        log = log_of(run)
+        log = run_log(run)
         assert log.t_s[-1] <= duration_s + 0.01
         assert not any(word in log_text(log) for word in ("nan", "inf"))
 

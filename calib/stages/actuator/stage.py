@@ -459,12 +459,12 @@ def _read_validate(
 ) -> tuple[Sequence[tuple[Track, Start | None]], Sequence[Trial], Rig]:
     """Tracks of the actuator with the estimator's starts, or trials of an arm, and the rig."""
     from calib.io.columns import is_arm_log
-    from calib.io.logs import columns_of
+    from calib.io.logs import read_column_names
     from calib.stages.actuator.validate import IMPROVED, begun_track, models_of
 
     logs = _with_states(files, options)
     if (rig.arm is not None and rig.actuator is None) or all(
-        is_arm_log(columns_of(path, options) or ()) for path in files.paths
+        is_arm_log(read_column_names(path, options) or ()) for path in files.paths
     ):
         arm = rig.needed("arm", files.rig_path)
         files.hashes |= rig.identities("arm")
@@ -489,13 +489,13 @@ def _solve_validate(
     from calib.stages.actuator.validate import compare, models_of
 
     if trials:
-        from calib.stages.arm.identify import errors_by, within
+        from calib.stages.arm.identify import inside_interval, parameter_errors
 
         assert rig.arm is not None
-        values = {one.name: rig.arm.values_on(one.day) for one in trials}
-        held = {one.name: errors_by(values[one.name], one) for one in trials}
+        values = {one.name: rig.arm.parameters_on_day(one.day) for one in trials}
+        held = {one.name: parameter_errors(values[one.name], one) for one in trials}
         half_rad = rig.arm.interval_rad or math.nan
-        met = {one.name: within(values[one.name], one, half_rad) for one in trials}
+        met = {one.name: inside_interval(values[one.name], one, half_rad) for one in trials}
         inside = {name: float(of.mean()) for name, of in met.items() if len(of) and math.isfinite(half_rad)}
         return Validated(held=held, inside=inside, interval_rad=half_rad)
     models = models_of(rig)

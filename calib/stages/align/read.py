@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.core.errors import BadInputError
 from calib.core.rig import Rig
-from calib.io.logs import Log, unclipped
+from calib.io.logs import Log, blank_clipped
 from calib.io.sensor_faults import held_places
 from calib.stages.align.solve import ASIDE_M, AlignLog, Settings
 from calib.stages.estimator.noise import grid_px
@@ -33,7 +33,7 @@ def align_log(log: Log) -> tuple[AlignLog | None, list[str]]:
 
     Raises `BadInputError` for time that runs backwards, and sensors that are stuck or contradict each other.
     """
-    heard, log = log.passed, unclipped(log)
+    heard, log = log.passed, blank_clipped(log)
     camera = log.signals("u_px", "v_px") if len(log.sampled("u_px", "v_px")) else None
     if not len(log.sampled("gz_radps")):
         has = "has no gyroscope (gz_radps), which an alignment needs"

@@ -20,7 +20,7 @@ from calib.core.arrays import BoolArray, FloatArray
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.stages.arm.model import STEP_S, Trial
-from calib.stages.arm.recording import Recording, span_of
+from calib.stages.arm.recording import Recording, span
 
 _MOUNTED_RAD = math.radians(60.0)
 """A turn at the start that is a body's mount: no arm rests so far bent."""
@@ -65,7 +65,7 @@ class Frame:
     direction: FloatArray | None = None
 
 
-def frame_of(recordings: Sequence[Recording]) -> Frame:
+def fit_frame(recordings: Sequence[Recording]) -> Frame:
     """The axis of bending, the quaternions' convention and the straight arm's direction.
 
     Of the two conventions that one is taken under which tip and chord turn the same way about the same axis.
@@ -76,12 +76,12 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
     angles = [one.planar[:, 0] for one in planar if one.planar is not None]
     sign, zero = 1.0, 0.0
     if angles:
-        begin = _circular_mean(np.array([_start_of(one) for one in angles]))
+        begin = _circular_mean(np.array([_initial_angle(one) for one in angles]))
         zero = begin if abs(begin) > _MOUNTED_RAD else 0.0
         sign = _growth_sign(planar, [_continuous(one, zero) for one in angles])
     if all(one.turned is None for one in recordings):
         return Frame(None, sign, zero)
-    frames = [_frame_by(recordings, conjugated) for conjugated in (False, True)]
+    frames = [_fit_frame_under(recordings, conjugated) for conjugated in (False, True)]
     # A body that is mounted by half a turn looks the same either way.
     best = max(
         frames, key=lambda one: round(math.copysign(math.cos(math.radians(one.planar_deg)), one.leans), 2)
@@ -89,7 +89,7 @@ def frame_of(recordings: Sequence[Recording]) -> Frame:
     return replace(best, grows=sign, zero_rad=zero)
 
 
-def _frame_by(recordings: Sequence[Recording], conjugated: bool) -> Frame:
+def _fit_frame_under(recordings: Sequence[Recording], conjugated: bool) -> Frame:
     """The frame under one convention, with a negative `leans` where the tip turns against its chord."""
     posed = [one for one in recordings if one.turned is not None and one.chord is not None]
     turned = [one.turned[int(conjugated)] for one in posed if one.turned is not None]
@@ -180,10 +180,10 @@ def _continuous(angles_rad: FloatArray, zero_rad: float = 0.0) -> FloatArray:
         return angles_rad
     mean = _circular_mean(angles_rad)
     out = mean - zero_rad + np.remainder(angles_rad - mean + math.pi, math.tau) - math.pi
-    return np.asarray(out - math.tau * round(_start_of(out) / math.tau))
+    return np.asarray(out - math.tau * round(_initial_angle(out) / math.tau))
 
 
-def _start_of(angles_rad: FloatArray) -> float:
+def _initial_angle(angles_rad: FloatArray) -> float:
     """Median of the first hundredth of the angles (n,) that are there."""
     seen = angles_rad[np.isfinite(angles_rad)]
     return float(np.median(seen[: max(len(seen) // 100, 1)])) if len(seen) else 0.0
@@ -212,9 +212,9 @@ def check_frame(recordings: Sequence[Recording], frame: Frame) -> None:
         if frame.axis is None or one.turned is None:
             continue
         angles = _twist(one.turned[int(frame.conjugated)], frame.axis, frame.mount)
-        if span_of(angles) < 4.0 * _LEAST_TURN_RAD:
+        if span(angles) < 4.0 * _LEAST_TURN_RAD:
             continue
-        axis = _frame_by([one], frame.conjugated).axis
+        axis = _fit_frame_under([one], frame.conjugated).axis
         off = 0.0 if axis is None else math.acos(min(max(float(axis @ frame.axis), -1.0), 1.0))
         if off > _TURNED_OFF_RAD:
             raise BadInputError(
@@ -270,7 +270,7 @@ def frame_findings(frame: Frame) -> Iterator[Finding]:
         )
 
 
-def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Trial:
+def resample_trial(recording: Recording, frame: Frame, day: str, load_kg: float) -> Trial:
     """The recording on the grid: commands as means over the steps, readings between their neighbours.
 
     Raises `BadInputError` where nothing but a command was logged.
@@ -285,12 +285,12 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
         turned = recording.turned[int(frame.conjugated)]
         angle = _interpolated(grid, t, _twist(turned, frame.axis, frame.mount))
         chord = _interpolated(grid, t, np.linalg.norm(recording.chord[0], axis=1))
-        unseen = _unseen(grid, t, turned)
+        unseen = _between_far_poses(grid, t, turned)
     elif recording.planar is not None:
         angles, chords = recording.planar.T
         angle = frame.grows * _interpolated(grid, t, _continuous(angles, frame.zero_rad))
         chord = _interpolated(grid, t, chords)
-        unseen = _unseen(grid, t, recording.planar)
+        unseen = _between_far_poses(grid, t, recording.planar)
     command = none if recording.command is None else _means(grid, t, recording.command)
     if not len(pressure) and not len(angle):
         raise BadInputError(f"{recording.source}: has neither pressure nor pose, expected one of them")
@@ -298,7 +298,7 @@ def trial_of(recording: Recording, frame: Frame, day: str, load_kg: float) -> Tr
     return Trial(recording.name, day, load_kg, *rest)
 
 
-def _unseen(grid: FloatArray, t: FloatArray, poses: FloatArray) -> BoolArray | None:
+def _between_far_poses(grid: FloatArray, t: FloatArray, poses: FloatArray) -> BoolArray | None:
     """Places of the grid (n,) between poses (m, k) that are far apart; None without any."""
     at = t[np.isfinite(poses).all(axis=1)]
     if len(at) < 2:

@@ -39,10 +39,10 @@ from calib.stages.arm.model import (
     Days,
     Scale,
     Trial,
+    data_scale,
     drive_run,
-    scale_of,
+    parameters_on_day,
     segment_run,
-    values_on,
 )
 
 _TRIED = ("toe", "inertia")
@@ -138,7 +138,9 @@ class Identification:
         return {"assembly": self.held, **self.others}
 
 
-def _bent(trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray) -> dict[str, FloatArray]:
+def _segment_residuals(
+    trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray
+) -> dict[str, FloatArray]:
     if not (len(trial.angle_rad) and len(pressure_kpa)):
         return {}
     angle, chord = segment_run(trial, values, pressure_kpa)
@@ -146,18 +148,18 @@ def _bent(trial: Trial, values: Mapping[str, float], pressure_kpa: FloatArray) -
     return {"angle_rad": (angle - trial.angle_rad)[seen], "chord_m": (chord - trial.chord_m)[seen]}
 
 
-def by_pressure(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
+def residuals_by_pressure(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
     """Simulated less measured values of the segment under the measured pressure, where poses were seen."""
-    return _bent(trial, values, trial.pressure_kpa)
+    return _segment_residuals(trial, values, trial.pressure_kpa)
 
 
-def by_command(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
+def residuals_by_command(trial: Trial, values: Mapping[str, float]) -> dict[str, FloatArray]:
     """Simulated less measured values of drive and segment under the command."""
     if not len(trial.command):
         return {}
     run = drive_run(trial, values)
     off = {"pressure_kpa": run - trial.pressure_kpa} if len(trial.pressure_kpa) else {}
-    return off | _bent(trial, values, run)
+    return off | _segment_residuals(trial, values, run)
 
 
 _Model = Callable[[Trial, Mapping[str, float]], dict[str, FloatArray]]
@@ -192,7 +194,7 @@ class _Problem:
         values = self.assembly.values(full[: len(PARAMETERS)], self.scale)
         days, rows = self.days(full), [x]
         for one in self.trials:
-            errors = model(one, values_on(one.day, values, days))
+            errors = model(one, parameters_on_day(one.day, values, days))
             rows += [error[::_EVERY] / self.sizes[name] for name, error in errors.items()]
         return np.asarray(np.clip(np.nan_to_num(np.concatenate(rows), nan=1e3), -1e3, 1e3))
 
@@ -233,11 +235,18 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
     covariance = np.eye(len(z))
     loose = problem.loosely("chord_m", _LOOSE)
     together = not any(len(one.pressure_kpa) and len(one.angle_rad) for one in trials)
-    steps = [(loose, by_pressure, segment), (problem, by_pressure, chord), (loose, by_command, drive)]
+    steps = [
+        (loose, residuals_by_pressure, segment),
+        (problem, residuals_by_pressure, chord),
+        (loose, residuals_by_command, drive),
+    ]
     if together:
-        steps = [(loose, by_command, np.concatenate([drive, segment])), (problem, by_command, chord)]
+        steps = [
+            (loose, residuals_by_command, np.concatenate([drive, segment])),
+            (problem, residuals_by_command, chord),
+        ]
     for weighed, model, free in steps:
-        if model is by_pressure or any(len(trial.command) for trial in trials):
+        if model is residuals_by_pressure or any(len(trial.command) for trial in trials):
             z, own = weighed.solve(model, z, free)
             covariance[free], covariance[:, free] = 0.0, 0.0
             covariance[np.ix_(free, free)] = own
@@ -256,17 +265,17 @@ def fit(trials: Sequence[Trial], assembly: Assembly, scale: Scale, start: Fit | 
 _NONE = np.zeros(0)
 
 
-def errors_by(values: Mapping[str, float], trial: Trial) -> Errors:
+def parameter_errors(values: Mapping[str, float], trial: Trial) -> Errors:
     """Free-run errors on a trial, of parameters by name on its day."""
-    off = by_command(trial, values)
-    bent = by_pressure(trial, values).get("angle_rad", _NONE)
+    off = residuals_by_command(trial, values)
+    bent = residuals_by_pressure(trial, values).get("angle_rad", _NONE)
     names = ("angle_rad", "chord_m", "pressure_kpa")
     return {name: rms(off.get(name, _NONE)) for name in names} | {"angle_by_pressure_rad": rms(bent)}
 
 
-def errors_of(made: Fit, trial: Trial) -> Errors:
+def fit_errors(made: Fit, trial: Trial) -> Errors:
     """Free-run errors of a fit on a trial."""
-    return errors_by(values_on(trial.day, made.values, made.days), trial)
+    return parameter_errors(parameters_on_day(trial.day, made.values, made.days), trial)
 
 
 # ----------------------------------------------------------------------
@@ -318,7 +327,7 @@ def _lag_error(train: Sequence[_Pair], test: _Pair) -> float:
     return rms(np.stack([lagged(u, best[1]), np.ones(len(u))], axis=1) @ best[2] - y)
 
 
-def _by_baseline(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Errors:
+def _baseline_errors(error: _Error, train: Sequence[Trial], trial: Trial, step_s: float = STEP_S) -> Errors:
     out, size = {}, round(step_s / STEP_S)
     for name, one in QUANTITIES.items():
         pairs = [
@@ -344,9 +353,9 @@ def baselines(trials: Sequence[Trial]) -> dict[str, dict[str, Errors]]:
         for step_s in _ARX_STEPS_S:
             for order in _ORDERS:
                 name = f"ARX {order} at {1.0 / step_s:g} Hz"
-                errors = _by_baseline(partial(_arx_error, order), train, trial, step_s)
+                errors = _baseline_errors(partial(_arx_error, order), train, trial, step_s)
                 out.setdefault(name, {})[trial.name] = errors
-        out.setdefault("a lag", {})[trial.name] = _by_baseline(_lag_error, train, trial)
+        out.setdefault("a lag", {})[trial.name] = _baseline_errors(_lag_error, train, trial)
     return out
 
 
@@ -368,7 +377,7 @@ def held_fits(
 
 def _held_errors(trials: Sequence[Trial], held: Mapping[str, Fit]) -> dict[str, Errors]:
     """Errors on each trial of the fit to the others, by name."""
-    return {one.name: errors_of(held[one.name], one) for one in trials}
+    return {one.name: fit_errors(held[one.name], one) for one in trials}
 
 
 def _deviations(made: Fit, held: Mapping[str, Fit]) -> dict[str, float]:
@@ -407,7 +416,7 @@ _WORTHWHILE = 0.8
 """Held error with smaller errors, of that with the usual ones, that speaks for them."""
 
 
-def _error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
+def _mean_held_error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
     """Geometric mean error of the held trials' angle by what drives the segment most closely.
 
     A trial that alone holds its load or day is far off whatever the parts, and outweighs no other.
@@ -420,7 +429,9 @@ def _error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
     return math.inf
 
 
-def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Scale, dict[str, Fit]]:
+def _fit_without_each(
+    trials: Sequence[Trial], assembly: Assembly, scale: Scale
+) -> tuple[Scale, dict[str, Fit]]:
     """Fits to all trials but one, and the scale of errors that predicts these best.
 
     The usual errors are those of arms that creep, stick and settle. One that follows its pressure closely
@@ -428,21 +439,21 @@ def _held(trials: Sequence[Trial], assembly: Assembly, scale: Scale) -> tuple[Sc
     """
 
     best = last = held_fits(trials, assembly, scale)
-    least = _WORTHWHILE * _error(trials, best)
+    least = _WORTHWHILE * _mean_held_error(trials, best)
     for finer in _FINER:
         other = replace(scale, finer=finer)
         last = held_fits(trials, assembly, other, last)
-        if (reached := _error(trials, last)) <= least:
+        if (reached := _mean_held_error(trials, last)) <= least:
             scale, best, least = other, last, reached
     return scale, best
 
 
-def within(values: Mapping[str, float], trial: Trial, half_rad: float) -> BoolArray:
+def inside_interval(values: Mapping[str, float], trial: Trial, half_rad: float) -> BoolArray:
     """Which samples (n,) of a trial's angle a free run meets to half an interval.
 
     From the command, or from the pressure of a trial without one, as in `angle_error`.
     """
-    off = by_command(trial, values) or by_pressure(trial, values)
+    off = residuals_by_command(trial, values) or residuals_by_pressure(trial, values)
     return np.asarray(np.abs(off.get("angle_rad", _NONE)) <= half_rad)
 
 
@@ -458,7 +469,7 @@ def _coverage(trials: Sequence[Trial], held: Mapping[str, Fit], errors: Mapping[
         wide = half_width([angle_error(errors[other.name]) for other in trials if other is not one])
         if math.isfinite(wide):
             made = held[one.name]
-            inside.append(within(values_on(one.day, made.values, made.days), one, wide))
+            inside.append(inside_interval(parameters_on_day(one.day, made.values, made.days), one, wide))
     every = np.concatenate(inside)
     return float(every.mean()) if len(every) else math.nan
 
@@ -517,7 +528,7 @@ def prospects(made: Fit) -> dict[str, dict[str, float]]:
         some = np.append(free, np.arange(len(made.z), len(z)))
         known = np.eye(len(some))
         known[: len(free), : len(free)] = np.linalg.inv(now)
-        J = problem.slopes(by_command, z, some, z[some])[len(some) :]
+        J = problem.slopes(residuals_by_command, z, some, z[some])[len(some) :]
         after = np.diag(np.linalg.inv(known + 2.0 * J.T @ J))[: len(free)]
         left = np.sqrt(after / np.diag(now))
         out[name] = {PARAMETERS[k].name: float(x) for k, x in zip(free, left, strict=True)}
@@ -525,7 +536,7 @@ def prospects(made: Fit) -> dict[str, dict[str, float]]:
 
 
 @dataclass(frozen=True)
-class _Chosen:
+class _Choice:
     """The assembly that predicts held trials best.
 
     Attributes
@@ -541,29 +552,31 @@ class _Chosen:
     others: Mapping[str, Mapping[str, Errors]]
 
 
-def _chosen(trials: Sequence[Trial], assembly: Assembly, drive: str, other_drive: str) -> _Chosen:
+def _choose_assembly(trials: Sequence[Trial], assembly: Assembly, drive: str, other_drive: str) -> _Choice:
     """The assembly with the one or the other drive, and with those of `_TRIED` that predict better."""
     assembly = assembly.driven_by(drive)
-    scale, held = _held(trials, assembly, scale_of(trials))
+    scale, held = _fit_without_each(trials, assembly, data_scale(trials))
     errors = _held_errors(trials, held)
     others: dict[str, Mapping[str, Errors]] = {}
     if any(len(one.command) for one in trials):
         driven = assembly.driven_by(other_drive)
         fits = held_fits(trials, driven, scale, held)
         by_other = _held_errors(trials, fits)
-        if mean_of(by_other, "angle_rad") <= _WORTHWHILE * mean_of(errors, "angle_rad"):
+        if mean_error(by_other, "angle_rad") <= _WORTHWHILE * mean_error(errors, "angle_rad"):
             others[f"a {drive} for the {other_drive}"] = errors
             assembly, held, errors = driven, fits, by_other
         else:
             others[f"a {other_drive} for the {drive}"] = by_other
     for name in _TRIED if any(len(one.angle_rad) for one in trials) else ():
         more = Assembly((*assembly.parts, name))
-        if _error(trials, held_fits(trials, more, scale)) <= _WORTHWHILE * _error(trials, held):
+        if _mean_held_error(trials, held_fits(trials, more, scale)) <= _WORTHWHILE * _mean_held_error(
+            trials, held
+        ):
             others[f"without {name}"] = errors
             assembly = more
-            scale, held = _held(trials, assembly, replace(scale, finer=1.0))
+            scale, held = _fit_without_each(trials, assembly, replace(scale, finer=1.0))
             errors = _held_errors(trials, held)
-    return _Chosen(assembly, scale, held, errors, others)
+    return _Choice(assembly, scale, held, errors, others)
 
 
 def identify(
@@ -582,10 +595,10 @@ def identify(
     drive, other_drive = ("lag", "pump") if any(one.pwm for one in trials) else ("valve", "lag")
     if len(trials) == 1:
         progress(1, 2)
-        made = fit(trials, assembly.driven_by(drive), scale_of(trials))
+        made = fit(trials, assembly.driven_by(drive), data_scale(trials))
         progress(2, 2)
         return Identification(tuple(trials), made, _deviations(made, {}), {}, {}, math.nan, prospects(made))
-    chosen = _chosen(trials, assembly, drive, other_drive)
+    chosen = _choose_assembly(trials, assembly, drive, other_drive)
     assembly, scale, held, others = chosen.assembly, chosen.scale, chosen.held, dict(chosen.others)
     parts = [name for name in WORTH if name in assembly.parts] if compare else []
     steps = 2 + len(parts)
@@ -605,23 +618,23 @@ def identify(
 def best_baseline(found: Identification, quantity: str) -> str:
     """Name of the ARX with the smallest mean error of a quantity of `QUANTITIES`."""
     arx = [name for name in found.others if name.startswith("ARX")]
-    return min(arx, key=lambda name: mean_of(found.others[name], quantity), default="")
+    return min(arx, key=lambda name: mean_error(found.others[name], quantity), default="")
 
 
-def mean_of(errors: Mapping[str, Errors], quantity: str) -> float:
+def mean_error(errors: Mapping[str, Errors], quantity: str) -> float:
     """Mean over the trials that have it, NaN without one."""
     values = [one[quantity] for one in errors.values() if math.isfinite(one[quantity])]
     return sum(values) / len(values) if values else math.nan
 
 
-def gained(found: Identification, baseline: str, quantity: str) -> tuple[float, float]:
+def gain_over_baseline(found: Identification, baseline: str, quantity: str) -> tuple[float, float]:
     """By how much smaller the mean held error is than a baseline's, and half its paired 95 % interval.
 
     Both are shares of the baseline's mean; the half is NaN for fewer than two trials.
     """
     pairs = [(found.others[baseline][name][quantity], one[quantity]) for name, one in found.held.items()]
     less = np.array([a - b for a, b in pairs if math.isfinite(a) and math.isfinite(b)])
-    mean = mean_of(found.others[baseline], quantity)
+    mean = mean_error(found.others[baseline], quantity)
     if not len(less):
         return math.nan, math.nan
     n = len(less)

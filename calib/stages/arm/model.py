@@ -441,7 +441,7 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
     return out
 
 
-def values_on(day: str, values: Mapping[str, float], days: Days) -> dict[str, float]:
+def parameters_on_day(day: str, values: Mapping[str, float], days: Days) -> dict[str, float]:
     """Parameters on a day; on one that was not seen their factors are the means of those that were."""
     seen = [days[day]] if day in days else list(days.values())
     logs = {name: [math.log(one.get(name, 1.0)) for one in seen] for name in DAILY if seen}
@@ -502,7 +502,7 @@ class Assembly:
         return Assembly((name, *self.without(*DRIVES).parts))
 
 
-def scale_of(trials: Sequence[Trial]) -> Scale:
+def data_scale(trials: Sequence[Trial]) -> Scale:
     """Size of what trials hold; that of a pressure without one is of the command, under a pump of the air."""
     commands = [one.command for one in trials if len(one.command)]
     pressures = [one.pressure_kpa for one in trials if len(one.pressure_kpa)]

@@ -72,7 +72,7 @@ class Recording:
     pwm: bool = False
 
 
-def recording_of(log: Log, name: str) -> Recording:
+def read_recording(log: Log, name: str) -> Recording:
     """The columns of an arm's log.
 
     Raises `BadInputError` for time that goes back, a log of less than 5 s, quaternions that are none, units
@@ -103,13 +103,15 @@ def recording_of(log: Log, name: str) -> Recording:
         command = log.columns[PWM[driven]]
     made = Recording(name, log.source, t, command, pressure, turned, chord, planar, tuple(findings), pwm)
     _check_sizes(made)
-    return replace(made, findings=(*findings, *_odd_pressures(made), *_frozen_signals(made), *_gaps(made)))
+    return replace(
+        made, findings=(*findings, *_odd_pressures(made), *_frozen_signals(made), *_unlogged(made))
+    )
 
 
 def _driven_chamber(log: Log) -> int:
     """Number of the driven chamber from 0. Raises `BadInputError` where none or several are."""
     for names in (COMMANDED, PWM, PRESSURES):
-        change = [span_of(log.columns[n]) if n in log.columns else 0.0 for n in names]
+        change = [span(log.columns[n]) if n in log.columns else 0.0 for n in names]
         # A sensor of a chamber that nobody drives is noisy too.
         least = _LEAST_SHARE * max(change) if names is PRESSURES else 0.0
         moving = [k for k, one in enumerate(change) if one > least]
@@ -126,11 +128,11 @@ def _driven_chamber(log: Log) -> int:
 def _constant_pressures(log: Log, name: str, driven: int) -> Iterator[Finding]:
     """Pressures of chambers that are not driven, where they never change."""
     others = [n for k, n in enumerate(PRESSURES) if k != driven and n in log.columns]
-    if constant := [n for n in others if span_of(log.columns[n]) == 0.0]:
+    if constant := [n for n in others if span(log.columns[n]) == 0.0]:
         yield Finding("remark", f"{name}: {', '.join(constant)} never change: frozen, not used")
 
 
-def span_of(values: FloatArray) -> float:
+def span(values: FloatArray) -> float:
     """Greatest less least value (n,) or column (n, k) that is there; 0 without any."""
     seen = values[np.isfinite(values).reshape(len(values), -1).all(axis=1)]
     return float(np.ptp(seen, axis=0).max()) if len(seen) else 0.0
@@ -306,7 +308,7 @@ def _frozen_signals(recording: Recording) -> Iterator[Finding]:
     if poses is None and recording.turned is not None:
         poses = recording.turned[0]
     signals = {"command": recording.command, "pressure": recording.pressure, "pose": poses}
-    there = {name: values for name, values in signals.items() if values is not None and span_of(values) > 0.0}
+    there = {name: values for name, values in signals.items() if values is not None and span(values) > 0.0}
     for name, values in there.items():
         least_s = _FROZEN_S[name]
         others = [other for other in there if other != name and (other != "pose" or name == "command")]
@@ -316,8 +318,8 @@ def _frozen_signals(recording: Recording) -> Iterator[Finding]:
                 continue
             # What moved before the signal stood still may still arrive.
             rows = slice(int(np.searchsorted(t, t[first] + 0.5 * least_s)), last + 1)
-            moves = _unsettled if name == "command" else span_of
-            moved = [other for other in others if moves(there[other][rows]) > _MOVES * span_of(there[other])]
+            moves = _unsettled_range if name == "command" else span
+            moved = [other for other in others if moves(there[other][rows]) > _MOVES * span(there[other])]
             if moved:
                 yield Finding(
                     "poor",
@@ -328,7 +330,7 @@ def _frozen_signals(recording: Recording) -> Iterator[Finding]:
                 break
 
 
-def _unsettled(values: FloatArray) -> float:
+def _unsettled_range(values: FloatArray) -> float:
     """By how much values (n,) or columns (n, k) move that do not settle: go back, or move most later on."""
     columns = values.reshape(len(values), -1)
     seen = columns[np.isfinite(columns).all(axis=1)]
@@ -336,11 +338,11 @@ def _unsettled(values: FloatArray) -> float:
         return 0.0
     falls, rises = np.maximum.accumulate(seen) - seen, seen - np.minimum.accumulate(seen)
     back = float(np.minimum(falls.max(axis=0), rises.max(axis=0)).max())
-    early, late = (span_of(half) for half in np.array_split(seen, 2))
+    early, late = (span(half) for half in np.array_split(seen, 2))
     return max(back, late if late > early else 0.0)
 
 
-def _gaps(recording: Recording) -> Iterator[Finding]:
+def _unlogged(recording: Recording) -> Iterator[Finding]:
     """Stretches in which nothing tells what drove the arm."""
     t = recording.t_s
     for name, values in (("command", recording.command), ("pressure", recording.pressure)):

@@ -15,7 +15,7 @@ from calib.stages.arm.model import (
     PARAMETERS,
     PARTS,
     Assembly,
-    values_on,
+    parameters_on_day,
 )
 
 _PLAIN_VALVE = {"input_s": 1e-4, "pilot_jump_kpa": NO_JUMP_KPA}
@@ -114,9 +114,9 @@ class Arm(Result):
         """The parts that play a part."""
         return Assembly(tuple(self.parts))
 
-    def values_on(self, day: str) -> dict[str, float]:
+    def parameters_on_day(self, day: str) -> dict[str, float]:
         """All parameters on a day, those of parts that are left out included."""
         values = self.parameters | self.assembly.off
         for name, earlier in _AS_SETTLING.items():
             values.setdefault(name, values[earlier])
-        return values_on(day, values, self.days)
+        return parameters_on_day(day, values, self.days)

@@ -78,12 +78,13 @@ def read_trials(
 
     Raises
     ------
-    BadInputError as `recording_of`, `frame_of`, `trial_of`; `UsageError` for statements about other logs.
+    BadInputError as `read_recording`, `fit_frame` and `resample_trial`.
+    UsageError for statements about logs that are not there.
     """
     from calib.core.units import parse_mass_kg
     from calib.io.logs import read_log
-    from calib.stages.arm.frame import check_frame, frame_findings, frame_of, trial_of
-    from calib.stages.arm.recording import recording_of
+    from calib.stages.arm.frame import check_frame, fit_frame, frame_findings, resample_trial
+    from calib.stages.arm.recording import read_recording
 
     names = [path.stem for path in files.named]
     if len(set(names)) < len(names):
@@ -95,12 +96,12 @@ def read_trials(
     recordings = []
     for path in files.paths:
         log = read_log(path, options, files.remarks)
-        recordings.append(recording_of(log, path.stem))
+        recordings.append(read_recording(log, path.stem))
         files.taken(path, log.beginning)
-    found = frame_of(recordings) if frame is None else frame
+    found = fit_frame(recordings) if frame is None else frame
     if frame is not None:
         check_frame(recordings, frame)
-    trials = tuple(trial_of(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
+    trials = tuple(resample_trial(one, found, days[one.name], loads.get(one.name, 0.0)) for one in recordings)
     loaded = ", ".join(f"{name} {kg:g} kg" for name, kg in loads.items() if name in used) or "none"
     files.remarks.append(f"days: {', '.join(sorted({days[name] for name in used}))}; loads: {loaded}")
     findings = [finding for one in recordings for finding in one.findings]
@@ -119,7 +120,7 @@ def _solve(
 ) -> Arm:
     """From trials, how motion capture is read, and what the recordings show."""
     from calib.core.result import finite_or_none, judged
-    from calib.stages.arm.identify import QUANTITIES, angle_error, half_width, identify, mean_of
+    from calib.stages.arm.identify import QUANTITIES, angle_error, half_width, identify, mean_error
     from calib.stages.arm.section import Arm, HeldTrial
 
     with progress("identifying") as tell:
@@ -137,9 +138,9 @@ def _solve(
         tip_zero_rad=frame.zero_rad,
         tip_grows=frame.grows,
         chord_leans=finite_or_none(abs(frame.leans)),
-        angle_error_rad=finite_or_none(mean_of(found.held, "angle_rad")),
-        chord_error_m=finite_or_none(mean_of(found.held, "chord_m")),
-        by_pressure_error_rad=finite_or_none(mean_of(found.held, "angle_by_pressure_rad")),
+        angle_error_rad=finite_or_none(mean_error(found.held, "angle_rad")),
+        chord_error_m=finite_or_none(mean_error(found.held, "chord_m")),
+        by_pressure_error_rad=finite_or_none(mean_error(found.held, "angle_by_pressure_rad")),
         interval_rad=finite_or_none(half_width([angle_error(one) for one in found.held.values()])),
         coverage=finite_or_none(found.coverage),
         held={
@@ -169,12 +170,12 @@ def _few_trials(found: Identification) -> Iterator[Finding]:
 
 
 def _beside_black_boxes(found: Identification) -> Iterator[Finding]:
-    from calib.stages.arm.identify import QUANTITIES, best_baseline, gained, mean_of
+    from calib.stages.arm.identify import QUANTITIES, best_baseline, gain_over_baseline, mean_error
 
     scale = found.fit.scale
     for quantity, one in QUANTITIES.items():
         name = best_baseline(found, quantity)
-        mean, half = gained(found, name, quantity) if name else (math.nan, math.nan)
+        mean, half = gain_over_baseline(found, name, quantity) if name else (math.nan, math.nan)
         if math.isnan(mean):
             continue
         text = (
@@ -182,14 +183,14 @@ def _beside_black_boxes(found: Identification) -> Iterator[Finding]:
             f"{'smaller' if mean > 0.0 else 'larger'} than that of {name} (paired, 95 %)"
         )
         size = scale.chord_m if quantity == "chord_m" else scale.angle_rad
-        worse = -mean * mean_of(found.others[name], quantity) > _MATTERS * size
+        worse = -mean * mean_error(found.others[name], quantity) > _MATTERS * size
         yield Finding("poor" if worse else "remark", text)
 
 
 def _coarse_prediction(found: Identification) -> Iterator[Finding]:
-    from calib.stages.arm.identify import mean_of
+    from calib.stages.arm.identify import mean_error
 
-    error, size = mean_of(found.held, "angle_rad"), found.fit.scale.angle_rad
+    error, size = mean_error(found.held, "angle_rad"), found.fit.scale.angle_rad
     if error > _COARSE * size:
         yield Finding(
             "poor",
@@ -306,7 +307,7 @@ _RULES = (
 def _words(arm: Arm) -> list[Block]:
     """Parameters with what identifies them, and one table of errors on trials held back."""
     from calib.core.words import BLANK, Line, Table, number
-    from calib.stages.arm.identify import QUANTITIES, mean_of
+    from calib.stages.arm.identify import QUANTITIES, mean_error
     from calib.stages.arm.model import PARTS
 
     found: Identification = arm.evidence
@@ -333,12 +334,12 @@ def _words(arm: Arm) -> list[Block]:
     blocks.append(Table(("one more trial, twice", "lowers deviations most"), tuple(ahead)))
 
     for name, of in QUANTITIES.items():
-        if math.isfinite(mean_of(found.held, name)):
+        if math.isfinite(mean_error(found.held, name)):
             table = [
                 (
                     model,
                     *(number(of.scale * one[name], places=2) for one in errors.values()),
-                    number(of.scale * mean_of(errors, name), places=2),
+                    number(of.scale * mean_error(errors, name), places=2),
                 )
                 for model, errors in found.models.items()
             ]

@@ -106,7 +106,7 @@ class Observer:
         r, offset, innovation = self.model.plant.bellows_radius_m, self.marker_offset_m, np.zeros(3)
         if not math.isnan(marker_m[0] + marker_m[1]):
             q = self._exposed()
-            away = np.array(marker_m) - marker_of(q, r, offset)
+            away = np.array(marker_m) - marker_position(q, r, offset)
             # Ten in a row are no outliers: the estimate itself is off.
             if float(np.hypot(*away)) <= _GATE_M or self._refused >= 10:
                 innovation[:2] = np.linalg.solve(marker_jacobian(q, r, offset), away)
@@ -122,14 +122,14 @@ class Observer:
         self._past_q = self._past_q + step[:2]
 
 
-def marker_of(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
+def marker_position(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
     """The marker (2,) [m] of the lengths (2,) [m] (3.6), (A.1)."""
     head = kinematics.forward(q_m, bellows_radius_m)
     return kinematics.marker_from_head(head[:2], head[2], offset_m)
 
 
 def marker_jacobian(q_m: FloatArray, bellows_radius_m: float, offset_m: float) -> FloatArray:
-    """d(x, y) / d(q1, q2), shape (2, 2), of `marker_of`."""
+    """d(x, y) / d(q1, q2), shape (2, 2), of `marker_position`."""
     phi, J = (
         float(kinematics.angle(q_m, bellows_radius_m)),
         kinematics.forward_jacobian(q_m, bellows_radius_m),

@@ -205,7 +205,7 @@ def follow(model: Model, q_m: FloatArray) -> Following:
     )
 
 
-def brought_in(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
+def move_into_reach(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     """Lengths (n, 2) [m] with those just outside of the reachable set on its edge, and the longest way there.
 
     The edge is found by Newton's method on the forces that hold them, cut to what the pumps can give. Lengths
@@ -257,7 +257,7 @@ def slowed(model: Model, q_m: FloatArray) -> tuple[FloatArray, float]:
     would take longer than two hours.
     """
     h = model.tick_s
-    q, moved = brought_in(model, q_m)
+    q, moved = move_into_reach(model, q_m)
     points, times = _path(q, h)
     outside = np.flatnonzero(~reachable(model, points))
     if len(outside):

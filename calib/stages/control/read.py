@@ -13,7 +13,7 @@ from calib.core.files import shown
 from calib.core.rig import Rig
 from calib.core.words import several
 from calib.core.writing import Kind, column_names, write_atomically
-from calib.io.logs import columns_of
+from calib.io.logs import read_column_names
 from calib.io.tables import read_cells
 from calib.stages.actuator.kinematics import inverse
 from calib.stages.control import references
@@ -135,7 +135,7 @@ _OWN = ("q1_m", "true_q1_m", "x_m", "phi_rad")
 
 def is_recorded(path: Path) -> bool:
     """Whether a file is a log of pictures without a reference of its own in it."""
-    return {"u_px", "v_px"} <= set(columns_of(path) or ()) and not set(column_names(path)) & set(_OWN)
+    return {"u_px", "v_px"} <= set(read_column_names(path) or ()) and not set(column_names(path)) & set(_OWN)
 
 
 def recorded_reference(path: Path, rig: Rig, rig_path: Path, model: Model) -> references.Reference:

@@ -180,7 +180,9 @@ def _tuned(section: Controller | None) -> Controller:
     return section
 
 
-def _back_of(model: Model, pid: Pid, back_s: float, share: float | None, sign: int = 1) -> BackOrientation:
+def _back_calculation(
+    model: Model, pid: Pid, back_s: float, share: float | None, sign: int = 1
+) -> BackOrientation:
     own = replace(pid, tick_s=model.tick_s)
     return BackOrientation(own, back_s, model, float("inf") if share is None else share, sign)
 
@@ -196,11 +198,13 @@ def _law(
     if name in ANGLE_PIDS:
         return _orientation(model, reference, ANGLE_PIDS[name])
     if name == "back":
-        return _back(reference, _back_of(model, ANGLE_PIDS["pid"], _BACK_S, _SHARE))
+        return _back(reference, _back_calculation(model, ANGLE_PIDS["pid"], _BACK_S, _SHARE))
     if name == "tuned-pid":
         own = _tuned(section).orientation
         pid = Pid(own.Kp_pwm_per_rad, own.Ki_pwm_per_rad_s, own.Kd_pwm_s_per_rad)
-        return _back(reference, _back_of(model, pid, own.back_calculation_s, own.falling_share, own.sign))
+        return _back(
+            reference, _back_calculation(model, pid, own.back_calculation_s, own.falling_share, own.sign)
+        )
     if name == "tuned-pd":
         gains = _tuned(section).position
         pid = Pid(gains.Kp_pwm_per_m, gains.Ki_pwm_per_m_s, gains.Kd_pwm_s_per_m)
@@ -276,7 +280,9 @@ def tune_back_calculation(
     found: dict[Pair, dict[str, float]] = {}
     for T, share in product(_TIMES_S, _SHARES):
         progress(len(found), len(_TIMES_S) * len(_SHARES))
-        found[T, share] = _jump(rig, model, reference, _back(reference, _back_of(model, pid, T, share)))
+        found[T, share] = _jump(
+            rig, model, reference, _back(reference, _back_calculation(model, pid, T, share))
+        )
 
     def merit(setting: Pair) -> Pair:
         late = max(found[setting]["rise_s"] - clamped["rise_s"] - model.tick_s, 0.0)

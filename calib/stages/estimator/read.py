@@ -16,7 +16,7 @@ from calib.core.files import shown
 from calib.core.options import LogOptions
 from calib.core.result import CovarianceTable
 from calib.core.rig import Rig
-from calib.io.logs import Log, in_order, iter_log, once, refuse_counts, unclipped
+from calib.io.logs import Log, blank_clipped, drop_repeated_rows, iter_log, refuse_counts, sort_rows
 from calib.solve.clock import time_axis
 from calib.stages.actuator.kinematics import inverse
 from calib.stages.actuator.section import Standing
@@ -264,7 +264,7 @@ def blocks(
         known = True
         if len(block):
             rows += len(block)
-            yield unclipped(once(in_order(_placed(block) if pose else block)))
+            yield blank_clipped(drop_repeated_rows(sort_rows(_placed(block) if pose else block)))
     if rows == 0:
         raise BadInputError(f"{shown(path)}: has a header but no rows")
 

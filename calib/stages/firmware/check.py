@@ -26,7 +26,7 @@ from calib.stages.firmware.conformance import (
     MARKER_HELD,
     Reference,
     Wanted,
-    reference_of,
+    make_reference,
 )
 from calib.stages.firmware.header import Header
 from calib.stages.firmware.vectors import TOLERANCE, tolerance
@@ -105,7 +105,7 @@ def read_frames(path: Path) -> list[Frame]:
     return frames
 
 
-def _driven(frame: Frame) -> bool:
+def _pumps_follow(frame: Frame) -> bool:
     """Whether the pumps got what the tick commanded, or nothing where the guard says so."""
     if frame.guard is None:
         return True
@@ -134,7 +134,7 @@ def _reference_for(header: Header, first: Frame, source: str) -> Reference:
     fused, mean_rate = bool(first.out.flags & BY_FUSED), bool(first.out.flags & BY_MEAN_RATE)
     if fused and not header.values["CALIB_HAS_FUSED"]:
         raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
-    return reference_of(header.values, fused=fused, mean_rate=mean_rate)
+    return make_reference(header.values, fused=fused, mean_rate=mean_rate)
 
 
 def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
@@ -186,5 +186,5 @@ def _wrong_decisions(frame: Frame, wanted: Wanted, allowed: Mapping[str, float])
         yield "the decision to clamp"
     if wanted.undecided_m > _UNDECIDED_M:
         yield "the decision on rest, motion or a marker to leave out"
-    if not _driven(frame):
+    if not _pumps_follow(frame):
         yield "what drives the pumps"

@@ -83,7 +83,7 @@ def late(given: Inputs) -> float:
     return given.late_ticks if known else 1.0
 
 
-def settled(own: bool, decided: int | None, bit: int, off: float) -> tuple[bool, float]:
+def decide(own: bool, decided: int | None, bit: int, off: float) -> tuple[bool, float]:
     """A decision as the firmware's flags have it, and where that is another how far it was from the limit.
 
     Parameters
@@ -319,7 +319,7 @@ class Reference:
             u, more = Kpd * e - Kd_h * e1 + m.sum[i], half * (e + e1)
             whole = u + more
             clamp = bool(c[f"{stem}_CLAMPING"]) and half != 0.0 and not low <= whole <= high
-            clamp, off = settled(clamp, decided, CLAMPED[i], min(abs(whole - low), abs(whole - high)))
+            clamp, off = decide(clamp, decided, CLAMPED[i], min(abs(whole - low), abs(whole - high)))
             undecided = max(undecided, off)
             if clamp:
                 flags |= CLAMPED[i]
@@ -329,7 +329,7 @@ class Reference:
             m.error[i] = e
             u += extra[i]
             off = min(abs(u - low), abs(u - high))
-            saturated, off = settled(not low <= u <= high, decided, SATURATED[i], off)
+            saturated, off = decide(not low <= u <= high, decided, SATURATED[i], off)
             undecided = max(undecided, off)
             if saturated:
                 flags |= SATURATED[i]
@@ -479,7 +479,7 @@ class FusedReference(Reference):
             f.follow(c["FUSED_BOOST"] * e)
             return 0, clip(c["FUSED_BOOST_PHI_PER_M"] * across, c["FUSED_BOOST"]), True, 0.0
         far = max(abs(across), abs(e)) - c["FUSED_GATE_M"]
-        rejected, undecided = settled(far > 0.0, decided, REJECTED, abs(far))
+        rejected, undecided = decide(far > 0.0, decided, REJECTED, abs(far))
         if rejected:
             f.rejected += 1
             f.rate *= c["FUSED_RATE_DECAY"]
@@ -489,7 +489,7 @@ class FusedReference(Reference):
         f.rejected = 0
         f.slow += c["FUSED_SLOW"] * (e - f.slow)
         over = max(abs(f.slow) - c["FUSED_MOVING_M"], abs(f.rate) - c["FUSED_STILL_M"])
-        moves, off = settled(over > 0.0, decided, MOVING, abs(over))
+        moves, off = decide(over > 0.0, decided, MOVING, abs(over))
         undecided = max(undecided, off)
         if moves:
             f.moving, flags = int(c["FUSED_MOVING_TICKS"]), MOVING
@@ -534,7 +534,7 @@ class FusedReference(Reference):
         return flags, head, (f.length + turned, f.length - turned), undecided
 
 
-def reference_of(
+def make_reference(
     values: Mapping[str, float], undistort: bool | None = None, fused: bool = False, mean_rate: bool = False
 ) -> Reference:
     """The reference for CALIB_FUSED and CALIB_RATE_IS_MEAN."""

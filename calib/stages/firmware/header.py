@@ -199,7 +199,7 @@ def verbatim(name: str) -> str:
     return resources.files("calib.stages.firmware").joinpath("templates", name).read_text("utf-8")
 
 
-def _inverse(rig: Rig) -> InverseLens | None:
+def _inverse_lens(rig: Rig) -> InverseLens | None:
     """The polynomial of the section lens where that is unchanged and of this camera, else a new one."""
     if rig.camera is None:
         return None
@@ -209,7 +209,7 @@ def _inverse(rig: Rig) -> InverseLens | None:
     return fit_inverse(rig.camera.optics)
 
 
-def _undone(inverse: InverseLens) -> bool:
+def _undoes_lens(inverse: InverseLens) -> bool:
     error = inverse.max_error_px
     return error is not None and error <= _INVERSE_PX and inverse.covered >= _INVERSE_SHARE
 
@@ -229,7 +229,7 @@ def _judge(rig: Rig, inverse: InverseLens | None) -> Iterator[Finding]:
     # With an alignment the header takes nothing from a log at rest.
     taken = [name for name in FLASHED if name != "imu" or rig.align is None]
     yield from _poor_sections(rig, taken)
-    if inverse is not None and not _undone(inverse):
+    if inverse is not None and not _undoes_lens(inverse):
         error = "without bound" if inverse.max_error_px is None else f"to {inverse.max_error_px:.3g} px only"
         text = f"the lens is undone {error}, over {inverse.covered:.0%} of the picture"
         yield Finding("poor", text, _UNREAD)
@@ -315,7 +315,7 @@ def _judge_envelope(stated: Envelope, allowed: Mapping[str, Any], rest_m: float)
     return [Finding("remark", text)] if wide else []
 
 
-def header_of(rig: Rig, source: str) -> Header:
+def make_header(rig: Rig, source: str) -> Header:
     """The header of a rig; one without a camera or plane makes a sketch that records.
 
     A lens that the firmware could not undo makes the camera's verdict in the header poor.
@@ -326,14 +326,16 @@ def header_of(rig: Rig, source: str) -> Header:
 
     Raises `BadInputError` for values that the firmware cannot run with, by their key.
     """
-    camera, inverse, plane = rig.camera, _inverse(rig), plane_constants(rig, source)
+    camera, inverse, plane = rig.camera, _inverse_lens(rig), plane_constants(rig, source)
     context = constants(Lookup(rig, source), plane)
     if camera is not None and inverse is not None:
         named = dict(zip(COEFFICIENTS, camera.optics.distortion.tolist(), strict=True))
         context |= {
             "lens": {name: named[name] for name in MODELS[camera.model]},
             "has_lens": camera.optics.fisheye or any(named.values()),
-            "camera_verdict": camera.verdict.word if _undone(inverse) or not camera.verdict.ok else "poor",
+            "camera_verdict": camera.verdict.word
+            if _undoes_lens(inverse) or not camera.verdict.ok
+            else "poor",
         }
     inputs = {
         f"{section}/{name}": digest

@@ -42,9 +42,9 @@ def _read(files: Files, rig: Rig, options: FirmwareOptions) -> tuple[Rig, str, S
 def _solve(rig: Rig, source: str, frames: Sequence[Frame] | None, log: str) -> Header | Check:
     """From a rig with its file's name, and the frames of a board with the name of their log."""
     from calib.stages.firmware.check import check_frames
-    from calib.stages.firmware.header import header_of
+    from calib.stages.firmware.header import make_header
 
-    header = header_of(rig, source)
+    header = make_header(rig, source)
     return header if frames is None else check_frames(header, frames, log)
 
 

@@ -19,7 +19,7 @@ from calib.stages.firmware.conformance import (
     Reference,
     binary32,
     late,
-    reference_of,
+    make_reference,
     sinc,
 )
 
@@ -98,7 +98,7 @@ def directed(constants: Mapping[str, float], ticks: int) -> list[Inputs]:
             mode=mode,
             late_ticks=_lateness(k),
         )
-        made.append(binary32(spoilt(given, k)))
+        made.append(binary32(spoil(given, k)))
     return made
 
 
@@ -153,7 +153,7 @@ def _losses(constants: Mapping[str, float], still: Inputs) -> list[tuple[Inputs,
     made += [(silent, hold + 1), (replace(silent, imu_read=True), 1)]
     # A picture that is left out is none, and the pumps do not go on for it.
     boost = int(constants.get("CALIB_FUSED_BOOST_TICKS", 0))
-    away = replace(still, u_px=_elsewhere(still.u_px))
+    away = replace(still, u_px=_pixels_away(still.u_px))
     lost = replace(still, marker_seen=False, mode=MODE_OFF)
     return [*made, (still, boost + 2), (lost, hold - 1), (away, 2), (still, 1)]
 
@@ -221,7 +221,7 @@ def _farther(constants: Mapping[str, float], still: Inputs, by_m: float) -> Inpu
     if seen.flags & MARKER_HELD:
         return still
     (X, Y), out = seen.marker_m, 1.0 + by_m / math.hypot(*seen.marker_m)
-    u, v = pixel_of(reference, out * X, out * Y, (still.u_px, still.v_px))
+    u, v = find_pixel(reference, out * X, out * Y, (still.u_px, still.v_px))
     return binary32(replace(still, u_px=u, v_px=v))
 
 
@@ -243,7 +243,7 @@ def vectors(
     ----------
     fused : for CALIB_FUSED 1. limits : with all that a tick has to refuse.
     """
-    reference = reference_of(constants, fused=fused)
+    reference = make_reference(constants, fused=fused)
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
     still = run[0]
     # What is known first is that the head is bent, and turns.
@@ -346,7 +346,7 @@ _SWING = 0.55
 _STEP = 1e-4
 
 
-def pixel_of(
+def find_pixel(
     reference: Reference, X: float, Y: float, near: tuple[float, float] | None = None
 ) -> tuple[float, float]:
     """The pixel that the header's own constants take to the place (X, Y) [m] in the plane, to 1e-6 px.
@@ -438,7 +438,7 @@ def coherent(
         chord = length * sinc(0.5 * phi)
         X = chord * math.sin(0.5 * phi) + d * math.sin(phi)
         Y = chord * math.cos(0.5 * phi) + d * math.cos(phi)
-        u, v = last = pixel_of(reference, X, Y, last)
+        u, v = last = find_pixel(reference, X, Y, last)
         angle, rate = motion.at(k)[0], motion.rate(k)
         ax, ay, gz = _readings(c, angle, rate)
         shaken = 0.8 if k % period < _SWING * period else 0.02
@@ -464,10 +464,10 @@ def directed_fused(
 ) -> list[Inputs]:
     """`coherent` readings with all that can go wrong: every part of estimator and controllers is reached."""
     given = coherent(constants, ticks, undistort, period)
-    return [binary32(_disturbed(one, k, period)) for k, one in enumerate(given)]
+    return [binary32(_disturb(one, k, period)) for k, one in enumerate(given)]
 
 
-def spoilt(given: Inputs, k: int) -> Inputs:
+def spoil(given: Inputs, k: int) -> Inputs:
     """Tick `k` as it comes: without marker, IMU or command every now and then, the reference out of reach."""
     if k % 29 == 17:
         given = replace(given, marker_seen=False)
@@ -480,16 +480,16 @@ def spoilt(given: Inputs, k: int) -> Inputs:
     return given
 
 
-def _elsewhere(u_px: float) -> float:
+def _pixels_away(u_px: float) -> float:
     """Where something else than the marker is in the picture."""
     return u_px + (25.0 if u_px < 150.0 else -25.0)
 
 
-def _disturbed(given: Inputs, k: int, period: int) -> Inputs:
+def _disturb(given: Inputs, k: int, period: int) -> Inputs:
     at = k % period
-    given = spoilt(given, k)
+    given = spoil(given, k)
     if k % 43 == 33:
         given = replace(given, ax_mps2=0.1, ay_mps2=-0.1)
     if k % 23 == 14 or 3 * period // 10 <= at < 3 * period // 10 + 8:
-        given = replace(given, u_px=_elsewhere(given.u_px))
+        given = replace(given, u_px=_pixels_away(given.u_px))
     return given

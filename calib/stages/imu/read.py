@@ -20,9 +20,9 @@ from calib.core.options import LogOptions
 from calib.core.rig import Rig
 from calib.core.verdict import Finding
 from calib.io.columns import ACCEL, GYRO, IMU, IN_PLANE
-from calib.io.logs import Log, Signals, log_of
+from calib.io.logs import Log, Signals, log_from_cells
 from calib.solve.clock import Part, time_axis
-from calib.solve.delay import delay_of
+from calib.solve.delay import estimate_delay
 from calib.stages.imu.drift import truth_late_s
 from calib.stages.imu.levelling import GAP_S
 from calib.stages.imu.sampling import (
@@ -211,7 +211,7 @@ def _lag(
     turned = own = integral(t, rate)
     if len(rate) * period_s >= SHORTEST_S + period_s:
         own = smooth_log(t, angle_of(part, axes), rate, DATA_SHEET.gyro, DATA_SHEET.walk).phi_rad
-    return delay_of(late_t_s, np.unwrap(late_rad), t, own, turned)
+    return estimate_delay(late_t_s, np.unwrap(late_rad), t, own, turned)
 
 
 def tune_log(log: Log, how: Reading) -> TuneLog:
@@ -366,4 +366,4 @@ def read_pose_files(accel: Path, gyro: Path | None, options: LogOptions) -> tupl
             w = np.stack([cells["t_s"], *(np.interp(cells["t_s"], w[:, 0], c) for c in w.T[1:])], axis=1)
             remarks.append(f"{shown(gyro)}: has other times than {source}; put on those by straight lines")
         cells |= {name: w[:, 1 + k] for k, name in enumerate(GYRO)}
-    return log_of(source, accel, cells, options), remarks
+    return log_from_cells(source, accel, cells, options), remarks

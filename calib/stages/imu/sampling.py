@@ -13,7 +13,7 @@ from calib.core.arrays import BoolArray, FloatArray, IntArray, blocks, runs
 from calib.core.errors import BadInputError
 from calib.core.verdict import Finding
 from calib.core.words import counted
-from calib.io.sensor_faults import clipped
+from calib.io.sensor_faults import at_range_end
 from calib.solve.clock import SPLIT_S, Gap, Part, time_axis
 from calib.stages.imu.levelling import GAP_S
 
@@ -245,7 +245,7 @@ def regular_parts(log: Readings) -> tuple[Sampling, tuple[Part, ...]]:
         step=np.array([_step(column) for column in values.T]),
         dropped=0.0 if axis.steady else _dropped(t_s),
         at_limit=np.array(
-            [clipped(column, bool(g)).sum() for column, g in zip(values.T, log.gyro, strict=True)],
+            [at_range_end(column, bool(g)).sum() for column, g in zip(values.T, log.gyro, strict=True)],
             dtype=np.int64,
         ),
     )

@@ -129,7 +129,7 @@ def digital_poles(sections: FloatArray) -> ComplexArray:
     return np.concatenate(found)
 
 
-def _placed(design: Design) -> list[tuple[float, float | None, float]]:
+def _place_sections(design: Design) -> list[tuple[float, float | None, float]]:
     """a1, a2 and 2 + c of each section, a2 None for a single pole; slow poles first."""
     K = math.tan(math.pi * design.cutoff_hz / design.rate_hz)
     zeros, poles = prototype(design.family, design.order)
@@ -152,13 +152,13 @@ def _placed(design: Design) -> list[tuple[float, float | None, float]]:
 def _section(a1: float, a2: float | None, across: float, places: int | None = None) -> list[float]:
     """b0, b1, b2, 1, a1, a2; with `places` a1 and a2 are rounded, and b0 where it does not follow."""
     if places is not None:
-        a1, a2 = _on_grid(a1, places), None if a2 is None else _on_grid(a2, places)
+        a1, a2 = _round_to_grid(a1, places), None if a2 is None else _round_to_grid(a2, places)
     if a2 is None:
         g = 0.5 * (1.0 + a1)
         return [g, g, 0.0, 1.0, a1, 0.0]
     g = (1.0 + a1 + a2) / across
     if places is not None and across != 4.0:
-        g = _on_grid(g, places)
+        g = _round_to_grid(g, places)
     return [g, 1.0 + a1 + a2 - 2.0 * g, g, 1.0, a1, a2]
 
 
@@ -172,7 +172,7 @@ def _rounded_section(a1: float, a2: float | None, across: float) -> list[float]:
     return section
 
 
-def _on_grid(value: float, places: int) -> float:
+def _round_to_grid(value: float, places: int) -> float:
     return float(np.float32(math.ldexp(round(math.ldexp(value, places)), -places)))
 
 
@@ -181,7 +181,7 @@ def design_lowpass(design: Design) -> Filter:
 
     Raises `BadInputError` where no rounded filter is stable: the cut-off is too low for the rate.
     """
-    placed = _placed(design)
+    placed = _place_sections(design)
     out = Filter(
         design,
         np.array([_section(*one) for one in placed]),

@@ -71,7 +71,7 @@ class Ticks:
         return max(self.pieces, key=lambda piece: len(piece.t_s))
 
 
-def on_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
+def resample_to_ticks(t_s: FloatArray, values: FloatArray, rate_hz: float) -> Ticks:
     """The samples (n, d), one or more, taken at times (n,) that do not run backwards, one per tick."""
     breaks = np.nonzero(np.diff(t_s) > max(LONGEST_HOLD_S, 2.0 / rate_hz))[0] + 1
     pieces, held, dropped = [], 0, 0

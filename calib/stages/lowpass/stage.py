@@ -98,7 +98,7 @@ def positions_from_log(
     """
     import numpy as np
 
-    from calib.stages.lowpass.jitter import Positions, on_ticks, spectrum
+    from calib.stages.lowpass.jitter import Positions, resample_to_ticks, spectrum
 
     signals = log.signals("u_px", "v_px")
     pixels = signals.values
@@ -123,12 +123,14 @@ def positions_from_log(
                     "designed for"
                 )
             rate_hz = signals.axis.nominal_hz
-        ticks = on_ticks(signals.t_s, values, rate_hz)
+        ticks = resample_to_ticks(signals.t_s, values, rate_hz)
         piece = ticks.longest.values
         spectra = (spectrum(piece[:, 0], rate_hz), spectrum(piece[:, 1], rate_hz))
     except BadInputError as error:
         raise BadInputError(f"{log.source}: {error}") from error
-    return Positions(log.source, unit, names, own, ticks, on_ticks(signals.t_s, pixels, rate_hz), spectra)
+    return Positions(
+        log.source, unit, names, own, ticks, resample_to_ticks(signals.t_s, pixels, rate_hz), spectra
+    )
 
 
 def _read(files: Files, rig: Rig, options: Options) -> tuple[Any, ...]:
