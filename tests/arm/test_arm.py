@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from armtrials import SCALE, TRUE, columns_of, simulated
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import calib.stages.arm.identify as identification
@@ -411,6 +412,16 @@ def test_an_arm_that_settles_slowly_under_a_held_command_is_sound(falls_s: float
     assert ("command stands still" in _findings(columns_of(settles), settles)) == frozen
 
 
+def test_an_arm_that_settles_after_its_pressure_is_gone_is_sound() -> None:
+    trial = simulated("a", 1)
+    since = trial.t_s % 20.0
+    pressure = np.where(since < 10.0, 40.0, np.maximum(40.0 * np.exp((10.0 - since) / 0.3) - 0.5, 0.0))
+    lag = math.exp(-STEP_S / 3.0)
+    angle = lfilter([1.0 - lag], [1.0, -lag], pressure / 40.0)
+    vented = replace(trial, command=np.where(since < 10.0, 40.0, 0.0), pressure_kpa=pressure, angle_rad=angle)
+    assert "poor" not in _findings(columns_of(vented), vented)
+
+
 def test_a_command_that_nobody_knows_and_a_place_that_jumps_are_told() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)
@@ -589,6 +600,11 @@ def test_what_is_no_single_driven_arm_is_refused() -> None:
     both = columns_of(trial) | {"p_cmd2_kpa": trial.command}
     with pytest.raises(BadInputError, match=r"p_cmd1_kpa, p_cmd2_kpa change, expected one .* one is driven"):
         read_recording(_log(both, trial), "a")
+    # A sensor of a chamber that nobody drives is noisy.
+    noise = 0.05 * np.random.default_rng(0).normal(size=len(trial.t_s))
+    uncommanded = {name: one for name, one in columns_of(trial).items() if name != "p_cmd1_kpa"}
+    recording = read_recording(_log(uncommanded | {"p2_kpa": noise}, trial), "a")
+    assert np.array_equal(recording.pressure, trial.pressure_kpa)
     bad = columns_of(trial)
     bad["tip_qw"] = 2.0 * bad["tip_qw"]
     with pytest.raises(BadInputError, match=r"line 2: the quaternion tip_qw, \.\.\. has norm 1\.9"):

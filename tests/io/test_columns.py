@@ -78,6 +78,9 @@ def _written(
         ("accélération y [g]", ("ay_mps2", "g")),
         ("velocità angolare z", ("gz_radps", "")),
         ("Magnetometer X (uT)", None),
+        ("x [px]", ("u_px", "px")),
+        ("millis [s]", None),
+        ("gyro_x_mdeg/s", ("gx_radps", "mdeg/s")),
         ("temperature", None),
         ("gear", None),
         ("mag_x", None),
@@ -413,6 +416,17 @@ def test_stamps_that_never_advance_tell_no_unit_of_rates(tmp_path: Path) -> None
     words = "the time `timestamp` is 1730000000 in every row, expected it to advance"
     with pytest.raises(BadInputError, match=words):
         read_log(path)
+
+
+def test_a_slow_swing_in_degrees_turns_too_far_to_be_in_rad(tmp_path: Path) -> None:
+    """From one second to the next it turns too little to be held against the force's turns."""
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(3000)
+    phi, rate = 0.07 * np.sin(0.6 * t), 0.07 * 0.6 * np.cos(0.6 * t)
+    gz = -rate + 0.003 * rng.normal(size=len(t))
+    names, force = ["t_s", "ax_mps2", "ay_mps2", "gz_radps"], [G * np.cos(phi), G * np.sin(phi)]
+    assert len(read_log(_written(tmp_path / "log.csv", names, [t, *force, gz]))) == len(t)
+    with pytest.raises(BadInputError, match=r"turns .* times as far as the accelerometer's angle"):
+        read_log(_written(tmp_path / "log.csv", names, [t, *force, np.degrees(gz)]))
 
 
 @pytest.mark.parametrize("felt", [0.0, 0.02, 0.05])
