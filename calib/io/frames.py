@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,6 +16,9 @@ from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import VIDEOS, check_readable, hash_of, is_bag, one_line, shown
 from calib.io.pictures import Picture, decoded_picture, eight_bits, split_fields
+
+if TYPE_CHECKING:
+    from calib.io.bag_topics import Topic
 
 # ----------------------------------------------------------------------
 # One pass over the frames. A stretch is a run of frames, of which the best is kept; when there are too
@@ -292,28 +295,16 @@ _GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
 
 
 def _bag_frames(path: Path, topic: str | None) -> Iterator[GrayImage]:
-    from calib.io.bag_topics import used_topics
     from calib.io.bags import opened_bag
 
     with opened_bag(path) as stream:
-        pictures = [one for one in stream.topics if one.kind in (_IMAGE, _COMPRESSED)]
-        kinds = {one.name: one.kind for one in used_topics(pictures)}
-        listed = ", ".join(one_line(name)[:80] for name in kinds) or "none"
-        if topic is not None and topic not in kinds:
-            raise BadInputError(f"{shown(path)}: has no image topic {one_line(topic)[:80]}; found {listed}")
-        if not kinds:
-            raise BadInputError(
-                f"{shown(path)}: holds no pictures, expected a topic of {_IMAGE} or {_COMPRESSED}"
-            )
-        if topic is None and len(kinds) > 1:
-            raise BadInputError(f"{shown(path)}: has several image topics, choose with --topic: {listed}")
-        chosen = topic or next(iter(kinds))
-        where = f"{shown(path)}: {one_line(chosen)[:80]}"
+        chosen = _image_topic(path, stream.topics, topic)
+        where = f"{shown(path)}: {one_line(chosen.name)[:80]}"
         damage: BadInputError | None = None
         count = 0
-        for _, _, message in stream.messages([chosen]):
+        for _, _, message in stream.messages([chosen.name]):
             try:
-                if kinds[chosen] == _COMPRESSED:
+                if chosen.kind == _COMPRESSED:
                     gray = decoded_picture(bytes(message.data), where, where, "").gray
                 else:
                     gray = _decode_image(message, where)
@@ -325,6 +316,24 @@ def _bag_frames(path: Path, topic: str | None) -> Iterator[GrayImage]:
             yield gray
         if damage is not None and not count:
             raise damage
+
+
+def _image_topic(path: Path, topics: Sequence[Topic], wanted: str | None) -> Topic:
+    """The topic of pictures, the only one or `wanted`. Raises `BadInputError` for none and for several."""
+    from calib.io.bag_topics import used_topics
+
+    pictures = used_topics([one for one in topics if one.kind in (_IMAGE, _COMPRESSED)])
+    listed = ", ".join(one_line(one.name)[:80] for one in pictures) or "none"
+    named = [one for one in pictures if wanted in (None, one.name)]
+    if wanted is not None and not named:
+        raise BadInputError(f"{shown(path)}: has no image topic {one_line(wanted)[:80]}; found {listed}")
+    if not named:
+        raise BadInputError(
+            f"{shown(path)}: holds no pictures, expected a topic of {_IMAGE} or {_COMPRESSED}"
+        )
+    if len(named) > 1:
+        raise BadInputError(f"{shown(path)}: has several image topics, choose with --topic: {listed}")
+    return named[0]
 
 
 def _decode_image(message: Any, where: str) -> GrayImage:

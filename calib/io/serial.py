@@ -520,6 +520,37 @@ def _sample_rows(message: ImuSample | Picture, time_s: float) -> list[tuple[floa
     ]
 
 
+class _Recorder:
+    """Logs of the starts of a board, written as they come; the first is held back for `_OPENING_S`."""
+
+    def __init__(self, write: Callable[[int, str], None]) -> None:
+        self._write, self._lines, self._held = write, "", True
+        self.rows, self.runs, self.opening = Rows(), list[Run](), 0
+
+    def take(self, message: Message) -> None:
+        """A message, which may be the first of another start."""
+        if self.rows.begins_anew(message):
+            if self._held:
+                self.opening += self.rows.count
+            else:
+                self.end()
+            self.rows, self._lines, self._held = Rows(), "", False
+        self._lines += self.rows.take(message)
+        self._held = self._held and self.rows.time_s < _OPENING_S
+
+    def flush(self) -> None:
+        """Write what is known to be of this start."""
+        if not self._held and self._lines:
+            self._write(len(self.runs), self._lines)
+            self._lines = ""
+
+    def end(self) -> None:
+        """Write the rest of this start's log, where anything came."""
+        if self.rows.count:
+            self._write(len(self.runs), self._lines + self.rows.rest())
+            self.runs.append(Run(self.rows.count, self.rows.lost))
+
+
 def record(
     read: Callable[[], bytes], more: Callable[[int], bool], write: Callable[[int, str], None]
 ) -> Recording:
@@ -531,41 +562,22 @@ def record(
     more : whether to go on, given the ticks so far of the run at hand.
     write : appends text to the log of a run, counted from 0, as it comes; to the first after `_OPENING_S`.
     """
-    decoder = Decoder()
-    rows, lines, held = Rows(), "", True
-    runs: list[Run] = []
-    opening = 0
-
-    def end() -> None:
-        write(len(runs), lines + rows.rest())
-        runs.append(Run(rows.count, rows.lost))
-
+    decoder, recorder = Decoder(), _Recorder(write)
     try:
-        while more(rows.count):
+        while more(recorder.rows.count):
             for message in decoder.feed(read()):
-                if rows.begins_anew(message):
-                    if held:
-                        opening += rows.count
-                    else:
-                        end()
-                    rows, lines, held = Rows(), "", False
-                lines += rows.take(message)
-                held = held and rows.time_s < _OPENING_S
-            if not held and lines:
-                write(len(runs), lines)
-                lines = ""
+                recorder.take(message)
+            recorder.flush()
     except KeyboardInterrupt:
         # Stopping by hand is the usual end; what came so far is the log, and nothing may stop its writing.
         if hasattr(signal, "setitimer"):
             signal.setitimer(signal.ITIMER_REAL, 0.0)
     except BadInputError:
         # The board is gone; what it sent is not.
-        if rows.count:
-            end()
+        recorder.end()
         raise
-    if rows.count:
-        end()
-    return Recording(tuple(runs), opening, decoder.skipped, decoder.damaged)
+    recorder.end()
+    return Recording(tuple(recorder.runs), recorder.opening, decoder.skipped, decoder.damaged)
 
 
 # ----------------------------------------------------------------------

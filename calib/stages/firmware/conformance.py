@@ -124,10 +124,10 @@ class Reference:
         )
         self.count = dict.fromkeys(COUNTERS, 0)
 
-    def _counted(self, name: str) -> None:
+    def _count(self, name: str) -> None:
         self.count[name] = min(self.count[name] + 1, 0xFFFF)
 
-    def _sampled(self, given: Inputs) -> bool:
+    def _usable_sample(self, given: Inputs) -> bool:
         """Whether the IMU's sample can be used; written so that NaN fails."""
         c = self.c
         limit, ax, ay = c["IMU_ACCEL_LIMIT_MPS2"], given.ax_mps2, given.ay_mps2
@@ -137,9 +137,9 @@ class Reference:
     def _angle(self, given: Inputs) -> int:
         c, m, flags = self.c, self.memory, 0
         ax, ay, gz = given.ax_mps2, given.ay_mps2, given.gz_radps
-        if not self._sampled(given):
+        if not self._usable_sample(given):
             m.imu_age = older(m.imu_age)
-            self._counted("imu")
+            self._count("imu")
             return IMU_HELD
         ax = c["IMU_SIGN_AX"] * ax - c["IMU_ACCEL_BIAS_X_MPS2"]
         ay = c["IMU_ACCEL_RATIO"] * (c["IMU_SIGN_AY"] * ay - c["IMU_ACCEL_BIAS_Y_MPS2"])
@@ -152,7 +152,7 @@ class Reference:
         if max(abs(ax), abs(ay)) <= c["IMU_ACCEL_WEAK_MPS2"]:
             if afresh:
                 m.imu_age = older(m.imu_age)
-                self._counted("imu")
+                self._count("imu")
                 return ACCEL_WEAK | IMU_HELD
             flags, e = ACCEL_WEAK, 0.0
         else:
@@ -172,9 +172,9 @@ class Reference:
             m.integral = clip(m.integral + c["MM_KI_DT2"] * e, c["MM_INTEGRAL_LIMIT_RAD"])
             m.phi += c["MM_KP_DT"] * e + m.integral - c["MM_DT_S"] * gz
         m.imu_age = 0
-        return flags | self._limited()
+        return flags | self._limit_angle()
 
-    def _limited(self) -> int:
+    def _limit_angle(self) -> int:
         """Cut the angle to its limit; the flag where that cuts."""
         phi, limit = self.memory.phi, self.c["PHI_LIMIT_RAD"]
         self.memory.phi = clip(phi, limit)
@@ -229,16 +229,16 @@ class Reference:
                 m.marker, flags = (X / W, Y / W), 0
             else:
                 flags = MARKER_HELD | HORIZON
-                self._counted("horizon")
+                self._count("horizon")
         if flags:
-            self._counted("marker")
+            self._count("marker")
             m.marker_age = older(m.marker_age)
             return flags, False
         afresh = m.marker_age > c["HOLD_TICKS"]
         m.marker_age = 0
         return 0, afresh
 
-    def _then(self, given: Inputs) -> float:
+    def _angle_at_exposure(self, given: Inputs) -> float:
         """The angle when the picture was exposed."""
         line = [*self.memory.past, self.memory.phi]
         return float(np.interp(1.0 + self.c["TIME_OFFSET_PART"] - late(given), np.arange(len(line)), line))
@@ -281,7 +281,7 @@ class Reference:
         low, high = c[f"calib_ff_table_pwm[{i}]"], c[f"calib_ff_table_pwm[{min(i + 1, last)}]"]
         return low + (min(at, last) - i) * (high - low)
 
-    def _pumps_off(self) -> tuple[float, float]:
+    def _stop_pumps(self) -> tuple[float, float]:
         self.memory.sum, self.memory.error = [0.0, 0.0], [0.0, 0.0]
         return self.c["PUMP_LOW_PWM"], self.c["PUMP_LOW_PWM"]
 
@@ -291,17 +291,17 @@ class Reference:
         c, m = self.c, self.memory
         position = given.mode == MODE_POSITION
         if given.mode != m.mode:
-            self._pumps_off()
+            self._stop_pumps()
             m.mode = given.mode
         if not position and given.mode != MODE_ORIENTATION:
-            return self._pumps_off(), 0, 0.0
+            return self._stop_pumps(), 0, 0.0
         if m.imu_age > c["HOLD_TICKS"] or (position and m.marker_age > c["HOLD_TICKS"]):
-            self._counted("stale")
-            return self._pumps_off(), STALE, 0.0
+            self._count("stale")
+            return self._stop_pumps(), STALE, 0.0
         wanted = given.reference if position else given.reference[:1]
         if not all(abs(r) <= REFERENCE_LIMIT for r in wanted):
-            self._counted("reference")
-            return self._pumps_off(), BAD_REFERENCE, 0.0
+            self._count("reference")
+            return self._stop_pumps(), BAD_REFERENCE, 0.0
         if position:
             stem, unit = "POSITION", "M"
             errors = [r - length for r, length in zip(given.reference, q, strict=True)]
@@ -310,34 +310,40 @@ class Reference:
             stem, unit = "ORIENTATION", "RAD"
             e = c["ORIENTATION_SIGN"] * (given.reference[0] - m.phi)
             errors, extra = [e, -e], [0.0, 0.0]
-        Kd_h, half = c[f"{stem}_KD_PER_DT_PWM_PER_{unit}"], c[f"{stem}_KI_HALF_DT_PWM_PER_{unit}"]
-        Kpd = c[f"{stem}_KPDI_PWM_PER_{unit}"] - half
-        low, high = c["PUMP_LOW_PWM"], c["PUMP_HIGH_PWM"]
-        pwm, flags, undecided = [], 0, 0.0
-        for i, e in enumerate(errors):
-            e1 = m.error[i]
-            u, more = Kpd * e - Kd_h * e1 + m.sum[i], half * (e + e1)
-            whole = u + more
-            clamp = bool(c[f"{stem}_CLAMPING"]) and half != 0.0 and not low <= whole <= high
-            clamp, off = decide(clamp, decided, CLAMPED[i], min(abs(whole - low), abs(whole - high)))
-            undecided = max(undecided, off)
-            if clamp:
-                flags |= CLAMPED[i]
-            else:
-                m.sum[i] += more
-                u = whole
-            m.error[i] = e
-            u += extra[i]
-            off = min(abs(u - low), abs(u - high))
-            saturated, off = decide(not low <= u <= high, decided, SATURATED[i], off)
-            undecided = max(undecided, off)
-            if saturated:
-                flags |= SATURATED[i]
-                m.sum[i] += c[f"{stem}_BACK"] * (min(max(u, low), high) - u)
-            pwm.append(min(max(u, low), high))
+        channels = [
+            self._channel(i, stem, unit, error, added, decided)
+            for i, (error, added) in enumerate(zip(errors, extra, strict=True))
+        ]
+        flags = channels[0][1] | channels[1][1]
         if flags & (SATURATED[0] | SATURATED[1]):
-            self._counted("saturated")
-        return (pwm[0], pwm[1]), flags, undecided
+            self._count("saturated")
+        return (channels[0][0], channels[1][0]), flags, max(undecided for *_, undecided in channels)
+
+    def _channel(
+        self, i: int, stem: str, unit: str, e: float, added: float, decided: int | None
+    ) -> tuple[float, int, float]:
+        """Command of a bellows, flags, and how far off its limit a decision was that went otherwise [PWM]."""
+        c, m, flags = self.c, self.memory, 0
+        Kd_h, half = c[f"{stem}_KD_PER_DT_PWM_PER_{unit}"], c[f"{stem}_KI_HALF_DT_PWM_PER_{unit}"]
+        Kpd, low, high = c[f"{stem}_KPDI_PWM_PER_{unit}"] - half, c["PUMP_LOW_PWM"], c["PUMP_HIGH_PWM"]
+        e1 = m.error[i]
+        u, more = Kpd * e - Kd_h * e1 + m.sum[i], half * (e + e1)
+        whole = u + more
+        clamp = bool(c[f"{stem}_CLAMPING"]) and half != 0.0 and not low <= whole <= high
+        clamp, undecided = decide(clamp, decided, CLAMPED[i], min(abs(whole - low), abs(whole - high)))
+        if clamp:
+            flags |= CLAMPED[i]
+        else:
+            m.sum[i] += more
+            u = whole
+        m.error[i] = e
+        u += added
+        off = min(abs(u - low), abs(u - high))
+        saturated, off = decide(not low <= u <= high, decided, SATURATED[i], off)
+        if saturated:
+            flags |= SATURATED[i]
+            m.sum[i] += c[f"{stem}_BACK"] * (min(max(u, low), high) - u)
+        return min(max(u, low), high), flags, max(undecided, off)
 
     def _estimate(self, given: Inputs, decided: int | None) -> tuple[int, Pair, Pair, float]:
         """Flags, head, lengths, and how far a decision that went otherwise was from its limit [m]."""
@@ -350,7 +356,7 @@ class Reference:
             head, turned = (0.0, c["REST_LENGTH_M"]), c["BELLOWS_RADIUS_M"] * phi
             q = (c["REST_LENGTH_M"] + turned, c["REST_LENGTH_M"] - turned)
         else:
-            then = self._then(given)
+            then = self._angle_at_exposure(given)
             d = c["MARKER_OFFSET_M"]
             x, y = m.marker[0] - d * math.sin(then), m.marker[1] - d * math.cos(then)
             head = (self._lowpass(0, x, afresh), self._lowpass(1, y, afresh))
@@ -429,7 +435,7 @@ class FusedReference(Reference):
         """Flags, whether the IMU's sample is used, and gravity along and across the head."""
         c, m, f = self.c, self.memory, self.fused
         A = B = turned = 0.0
-        flags, sampled = 0, self._sampled(given)
+        flags, sampled = 0, self._usable_sample(given)
         if sampled:
             ax, ay = c["IMU_SIGN_AX"] * given.ax_mps2, c["IMU_SIGN_AY"] * given.ay_mps2
             A = c["FUSED_ACCEL_11"] * ax + c["FUSED_ACCEL_12"] * ay - c["FUSED_ACCEL_1"]
@@ -452,12 +458,12 @@ class FusedReference(Reference):
             m.imu_age = 0
         else:
             m.imu_age = older(m.imu_age)
-            self._counted("imu")
+            self._count("imu")
             flags |= IMU_HELD
         m.past = [*m.past[1:], turned]
         return flags, sampled, A, B
 
-    def _then(self, given: Inputs) -> float:
+    def _angle_at_exposure(self, given: Inputs) -> float:
         m, delay = self.memory, self.c["FUSED_DELAY_TICKS"] + late(given)
         line = m.phi - np.cumsum([0.0, *reversed(m.past)])
         return clip(float(np.interp(delay, np.arange(len(line)), line)), self.c["PHI_LIMIT_RAD"])
@@ -484,7 +490,7 @@ class FusedReference(Reference):
             f.rejected += 1
             f.rate *= c["FUSED_RATE_DECAY"]
             m.marker_age = older(age)
-            self._counted("rejected")
+            self._count("rejected")
             return REJECTED, 0.0, False, undecided
         f.rejected = 0
         f.slow += c["FUSED_SLOW"] * (e - f.slow)
@@ -511,7 +517,7 @@ class FusedReference(Reference):
         flags |= BY_FUSED | (BY_MEAN_RATE if self.mean_rate else 0)
         seen, afresh = self._marker(given)
         flags |= seen
-        then = self._then(given)
+        then = self._angle_at_exposure(given)
         correction = 0.0
         if sampled and not flags & ACCEL_WEAK:
             whole = c["FUSED_ACCEL_GAIN"]
@@ -528,7 +534,7 @@ class FusedReference(Reference):
         if sampled and not f.boost:
             f.bias = clip(f.bias + c["FUSED_BIAS"] * correction, c["MM_INTEGRAL_LIMIT_RAD"])
         m.phi += correction
-        flags |= self._limited()
+        flags |= self._limit_angle()
         turned = c["BELLOWS_RADIUS_M"] * m.phi
         head = (f.chord * math.sin(0.5 * then), f.chord * math.cos(0.5 * then))
         return flags, head, (f.length + turned, f.length - turned), undecided
