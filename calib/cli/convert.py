@@ -95,8 +95,8 @@ def convert(
         narrate(f"left out: {', '.join(first.unknown)}")
     for sentence in passed.sentences:
         narrate(sentence)
-    if beyond.beyond:
-        many = f"{beyond.beyond} cells hold more than any sensor gives ({beyond.first})"
+    if beyond.implausible:
+        many = f"{beyond.implausible} cells hold more than any sensor gives ({beyond.first_implausible})"
         narrate(f"{many}; they are written, and other verbs pass them over")
     if back:
         more = f", as in {back - 1} more lines" * (back > 1)

@@ -195,7 +195,7 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
         lines = np.arange(first, first + len(stamps), dtype=np.int64)
         first += len(stamps)
         named = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(columns)}
-        return Block({"t_s": t_s, **named}, lines, Passed(infinite, twice=twice))
+        return Block({"t_s": t_s, **named}, lines, Passed(infinite, repeated=twice))
 
     stamps, values = np.empty(0, dtype=np.int64), np.empty((0, len(columns)))
     try:
@@ -208,7 +208,7 @@ def rows_from_messages(source: str, stream: Source, topics: TopicMap) -> Iterato
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
         last = made(stamps, values)
-        passed = last.passed + Passed(truncated=stream.truncated, times=_odd_times(source, clocks))
+        passed = last.passed + Passed(truncated=stream.truncated, odd_times=_odd_times(source, clocks))
         yield replace(last, passed=passed)
     except OverflowError as error:
         raise BadInputError(f"{source}: has a time that is none: {error}") from error

@@ -260,7 +260,7 @@ def blank_impossible(log: Log) -> Log:
         for name, values in log.columns.items()
         if log.unit(name) != "counts"
     }
-    return _blanked(log, far, lambda count, first: Passed(beyond=count, first=first))
+    return _blanked(log, far, lambda count, first: Passed(implausible=count, first_implausible=first))
 
 
 def _blanked(log: Log, cells: Mapping[str, IntArray], passed: Callable[[int, str], Passed]) -> Log:
@@ -278,7 +278,7 @@ def blank_clipped(log: Log) -> Log:
     """The log with blanks for readings of the IMU at the end of their range: the truth is beyond."""
     names = (name for name in IMU if name in log.columns and log.unit(name) != "counts")
     end = {name: np.flatnonzero(at_range_end(log.columns[name], kind_of(name) == "gyro")) for name in names}
-    return _blanked(log, end, lambda count, first: Passed(clipped=count, end=first))
+    return _blanked(log, end, lambda count, first: Passed(clipped=count, first_clipped=first))
 
 
 def _unwrap_time(blocks: Iterator[Block], dates: bool) -> Iterator[Block]:
@@ -470,7 +470,7 @@ def sort_rows(log: Log) -> Log:
     back = np.diff(log.t_s[by_writer]) < 0.0
     if (back & (np.diff(writer[by_writer]) == 0)).any():
         return log
-    return _select_rows(log, np.argsort(log.t_s, kind="stable"), Passed(sorted=int(late.sum())))
+    return _select_rows(log, np.argsort(log.t_s, kind="stable"), Passed(reordered=int(late.sum())))
 
 
 def _select_rows(log: Log, rows: IntArray | BoolArray, passed: Passed) -> Log:
@@ -485,7 +485,7 @@ def drop_repeated_rows(log: Log) -> Log:
     again = _repeats_row_before(log.t_s, log.columns.values())
     if not again.any():
         return log
-    return _select_rows(log, np.concatenate([[True], ~again]), Passed(twice=int(again.sum())))
+    return _select_rows(log, np.concatenate([[True], ~again]), Passed(repeated=int(again.sum())))
 
 
 def _repeats_row_before(t_s: FloatArray, columns: Iterable[FloatArray]) -> BoolArray:

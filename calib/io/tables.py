@@ -42,32 +42,32 @@ class Passed:
     Attributes
     ----------
     not_finite : cells that said nan or inf; in Parquet nan is a blank.
-    beyond : cells that hold more than any sensor gives. first : the first of them, in words.
-    clipped : readings at the end of their sensor's range. end : the first of them, in words.
+    implausible : cells that hold more than any sensor gives. first_implausible : the first of them, in words.
+    clipped : readings at the end of their sensor's range. first_clipped : the first of them, in words.
     outside : pictures that put the marker outside of them or at (0, 0).
     truncated : whether the last line was cut short and left out.
     wraps : how often the counter that is the time began again.
-    sorted : rows that stood below a later one, and were put where they belong.
-    twice : rows that say what the one before says, at its time, and were left out.
-    said : lines of words alone between the rows, as a board prints them.
-    damaged : lines that are no row, few among many. damage : what is wrong with the first of them.
-    times : what is odd about the times of a bag's messages, in words.
+    reordered : rows that stood below a later one, and were put where they belong.
+    repeated : rows that say what the one before says, at its time, and were left out.
+    prose : lines of words alone between the rows, as a board prints them.
+    damaged : lines that are no row, few among many. first_damaged : what is wrong with the first of them.
+    odd_times : what is odd about the times of a bag's messages, in words.
     """
 
     not_finite: int = 0
-    beyond: int = 0
-    first: str = ""
+    implausible: int = 0
+    first_implausible: str = ""
     truncated: bool = False
     wraps: int = 0
     outside: int = 0
     clipped: int = 0
-    end: str = ""
-    sorted: int = 0
-    twice: int = 0
-    said: int = 0
+    first_clipped: str = ""
+    reordered: int = 0
+    repeated: int = 0
+    prose: int = 0
     damaged: int = 0
-    damage: str = ""
-    times: str = ""
+    first_damaged: str = ""
+    odd_times: str = ""
 
     def __add__(self, later: Passed) -> Passed:
         both = ((getattr(self, one.name), getattr(later, one.name)) for one in fields(self))
@@ -80,24 +80,31 @@ class Passed:
         blank = "and count as blank"
         kinds = (
             (self.not_finite, f"{self.not_finite} cells say nan or inf {blank}"),
-            (self.beyond, f"{self.beyond} cells hold more than any sensor gives ({self.first}) {blank}"),
+            (
+                self.implausible,
+                f"{self.implausible} cells hold more than any sensor gives "
+                f"({self.first_implausible}) {blank}",
+            ),
             (self.outside, f"{self.outside} pictures put the marker outside of them or at (0, 0) {blank}"),
             (
                 self.clipped,
-                f"{self.clipped} readings are at the end of a sensor's range ({self.end}) {blank}",
+                f"{self.clipped} readings are at the end of a sensor's range ({self.first_clipped}) {blank}",
             ),
             (self.truncated, "the last line is cut short and left out"),
             (self.wraps, f"the time begins again {self.wraps} times, as counters and days do; counted on"),
-            (self.sorted, f"{self.sorted} rows stand below a later one, each sensor's own in order; sorted"),
-            (self.twice, f"{self.twice} rows are written twice; left out"),
-            (self.said, f"{self.said} lines between the rows hold words and no number; passed over"),
-            (self.damaged == 1, f"a line came damaged and is left out, {self.damage}"),
+            (
+                self.reordered,
+                f"{self.reordered} rows stand below a later one, each sensor's own in order; sorted",
+            ),
+            (self.repeated, f"{self.repeated} rows are written twice; left out"),
+            (self.prose, f"{self.prose} lines between the rows hold words and no number; passed over"),
+            (self.damaged == 1, f"a line came damaged and is left out, {self.first_damaged}"),
             (
                 self.damaged > 1,
-                f"{self.damaged} lines came damaged and are left out, the first {self.damage}",
+                f"{self.damaged} lines came damaged and are left out, the first {self.first_damaged}",
             ),
         )
-        return [sentence for there, sentence in (*kinds, (self.times, self.times)) if there]
+        return [sentence for there, sentence in (*kinds, (self.odd_times, self.odd_times)) if there]
 
 
 ALL_TAKEN = Passed()
@@ -294,7 +301,7 @@ def _parsed_by_line(text: _Text, data: bytes, lines: IntArray) -> Block:
     for row, (raw, line) in enumerate(zip(data.split(b"\n"), lines.tolist(), strict=False)):
         words = raw.decode("utf-8", "replace").rstrip("\r")
         if _is_prose(text, words):
-            taken[row], passed = False, passed + Passed(said=1)
+            taken[row], passed = False, passed + Passed(prose=1)
             continue
         try:
             values[row] = _row(text, words, line)
@@ -307,7 +314,7 @@ def _parsed_by_line(text: _Text, data: bytes, lines: IntArray) -> Block:
     odd = _blanked(values)
     cells_of = {name: np.ascontiguousarray(values[:, k]) for k, name in enumerate(text.slots)}
     damage = str(first).removeprefix(f"{text.source}, ").partition(";")[0] if first else ""
-    return Block(cells_of, lines, passed + Passed(odd, damage=damage))
+    return Block(cells_of, lines, passed + Passed(odd, first_damaged=damage))
 
 
 _ROWS_PER_DAMAGED = 200

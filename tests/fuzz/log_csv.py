@@ -88,7 +88,7 @@ def _log(data: bytes, path: Path) -> None:
                 wanted = float(cell) if cell.strip() else math.nan
                 wanted = wanted if math.isfinite(wanted) else math.nan
                 blank = math.isnan(wanted) or (
-                    log.passed.beyond > 0
+                    log.passed.implausible > 0
                     and kind_of(name) in ("accel", "gyro", "pixel")
                     and abs(wanted) > 1e2
                 )

@@ -242,7 +242,7 @@ def test_wild_cells_count_as_blank(written: Any, name: str) -> None:
     readings = np.loadtxt(written(np.arange(3000)), delimiter=",", skiprows=1)[:, 1:]
     readings[[700, 1400, 2100], IN_PLANE.index(name)] = 1e6, -1e7, 1e300
     log = Log.load(written(np.arange(3000), readings))
-    assert (log.passed.beyond, log.passed.first) == (3, f"{name} is 1e+06 in line 702")
+    assert (log.passed.implausible, log.passed.first_implausible) == (3, f"{name} is 1e+06 in line 702")
     assert np.isnan(log.columns[name]).sum() == 3 and np.nanmax(np.abs(log.columns[name])) < 12.0
     assert any("3 cells hold more than any sensor gives" in one for one in log.remarks())
 
