@@ -21,7 +21,7 @@ from calib.io.columns import ACCEL, GYRO, IMU, IN_PLANE, MARKER, MEASURED, Colum
 from calib.io.inferred_units import turning
 
 
-class Rows(Protocol):
+class LogRows(Protocol):
     """The rows of a log, or of a block of it; see `calib.io.logs.Log`."""
 
     @property
@@ -79,7 +79,7 @@ class Watch:
     _stopped: Finding | None = None
     _stuck: Finding | None = None
 
-    def add(self, log: Rows) -> None:
+    def add(self, log: LogRows) -> None:
         """Rows that follow."""
         for name in set(self.names) & set(log.columns):
             count, least, most = self._seen.get(name, (0, math.inf, -math.inf))
@@ -121,7 +121,7 @@ class Watch:
         return [*out, *(one for one in more if one is not None)]
 
 
-def _held_rows(log: Rows) -> list[tuple[int, int]]:
+def _held_rows(log: LogRows) -> list[tuple[int, int]]:
     """Rows, from and to, in which the whole IMU repeats one reading for longer than chance and steps explain.
 
     Of an IMU with at least one axis of each sensor and three in all; the first of equal readings is not among
@@ -135,7 +135,7 @@ def _held_rows(log: Rows) -> list[tuple[int, int]]:
     return [(int(rows[a + 1]), int(rows[b]) + 1) for a, b in _long_repeats(same, log.t_s[rows])]
 
 
-def _repeats(log: Rows, names: Sequence[str], rows: IntArray) -> BoolArray:
+def _repeats(log: LogRows, names: Sequence[str], rows: IntArray) -> BoolArray:
     """Whether each of these columns repeats its reading in a row, (names, rows - 1)."""
     values = np.stack([log.columns[name][rows] for name in names])
     return np.asarray(values[:, 1:] == values[:, :-1])
@@ -150,7 +150,7 @@ def _long_repeats(same: BoolArray, t_s: FloatArray) -> list[tuple[int, int]]:
     return [(a, b) for a, b in runs(same) if b - a >= least and t_s[b] - t_s[a] >= _HELD_S]
 
 
-def _stuck_axis(log: Rows, names: Sequence[str]) -> Finding | None:
+def _stuck_axis(log: LogRows, names: Sequence[str]) -> Finding | None:
     """The first of these columns that repeats one reading while other axes of its sensor go on changing."""
     for sensor in (GYRO, ACCEL):
         axes = [name for name in sensor if name in log.columns]
@@ -168,7 +168,7 @@ def _stuck_axis(log: Rows, names: Sequence[str]) -> Finding | None:
     return None
 
 
-def _imu_stopped(log: Rows, held: Sequence[tuple[int, int]]) -> Finding | None:
+def _imu_stopped(log: LogRows, held: Sequence[tuple[int, int]]) -> Finding | None:
     """That the whole IMU stops answering, where it does."""
     if not held:
         return None
@@ -178,7 +178,7 @@ def _imu_stopped(log: Rows, held: Sequence[tuple[int, int]]) -> Finding | None:
     return Finding("poor", f"{text}; they tell nothing", _CHECK_IMU)
 
 
-def _silent_gyro(log: Rows) -> Finding | None:
+def _silent_gyro(log: LogRows) -> Finding | None:
     """Where the accelerometer moves and the gyroscope is stuck, or does not answer its turns.
 
     Of a sensor that tilts the angle turns about all three axes (`calib.stages.imu.tracks`); far out of the
@@ -260,7 +260,7 @@ def _unanswered_turns(
     )
 
 
-def _mirrored_axes(log: Rows) -> tuple[bool, Finding | None]:
+def _mirrored_axes(log: LogRows) -> tuple[bool, Finding | None]:
     """Whether a log turns far enough to tell which way, and what is wrong about it."""
     rows = log.sampled(*IN_PLANE)[:_WINDOW]
     if len(rows) < 2 * FEWEST:
@@ -307,7 +307,7 @@ def at_range_end(values: FloatArray, gyro: bool) -> BoolArray:
     return out
 
 
-def marker_places(log: Rows) -> tuple[IntArray, FloatArray]:
+def marker_places(log: LogRows) -> tuple[IntArray, FloatArray]:
     """Rows (n,) with the marker's place, and the places (n, 2)."""
     rows = log.sampled(*MARKER)
     at = np.stack([log.columns[name][rows] for name in MARKER], axis=1) if len(rows) else np.zeros((0, 2))
@@ -321,7 +321,7 @@ _FEWEST_CHANGES, _IN_PHASE, _REPEATING = 40, 0.97, 0.05
 share of pictures in motion that repeat above that of whole pixels: below 0 in 24 sound logs."""
 
 
-def held_places(log: Rows) -> str:
+def held_places(log: LogRows) -> str:
     """What shows that cells of the marker's place hold their last value between pictures; empty otherwise.
 
     Such places are late by up to a period of the camera.

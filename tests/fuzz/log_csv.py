@@ -8,6 +8,10 @@ from pathlib import Path
 
 MODULES = (
     "calib.io.logs",
+    "calib.io.tables",
+    "calib.io.columns",
+    "calib.io.inferred_units",
+    "calib.io.sensor_faults",
     "calib.stages.actuator.read",
     "calib.stages.control.read",
     "calib.stages.firmware.check",
