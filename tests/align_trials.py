@@ -10,8 +10,8 @@ from estimatorlogs import truth_of_sensors
 from calib.core.arrays import FloatArray
 from calib.io.logs import Log
 from calib.stages.align.read import PRIOR as USUAL_PRIOR
-from calib.stages.align.solve import AlignLog, Alignment, Settings, rest_angle
-from calib.stages.estimator.sensors import SENSOR, sensor_values, view_coefficients
+from calib.stages.align.solve import AlignLog, Alignment, Settings
+from calib.stages.estimator.sensors import SENSOR, rest_reading, sensor_values, view_coefficients
 from calib.twin.rig import SimulatedRig
 from calib.twin.scenarios import make_scenario, run_scenario
 from calib.twin.sensors import Imu, Tracker
@@ -105,6 +105,6 @@ def prior_settings(view: FloatArray) -> Settings:
 
 def scores(trial: Trial, found: Alignment) -> FloatArray:
     """Errors over sigma (14,): of `SENSOR`, then of the angle at rest."""
-    rest = (found.rest_angle_rad - rest_angle(trial.truth)[0]) / found.rest_angle_sigma
+    rest = (found.rest_angle_rad - rest_reading(trial.truth)[0][0]) / found.rest_angle_sigma
     assert len(found.sensor) == len(SENSOR)
     return np.append((found.sensor - trial.truth) / found.sigma, rest)

@@ -48,10 +48,9 @@ from calib.io.logs import log_text
 from calib.stages.actuator.identify import values_of
 from calib.stages.actuator.pump import Orifice
 from calib.stages.align.section import SENSORS_OF
-from calib.stages.align.solve import rest_angle
 from calib.stages.estimator.replay import replay_log
 from calib.stages.estimator.section import Replayed
-from calib.stages.estimator.sensors import QUANTITIES, SENSOR
+from calib.stages.estimator.sensors import QUANTITIES, SENSOR, rest_reading
 from calib.twin.folder import LOGS, write_rig_folder
 from calib.twin.pictures import CAMERA, PLANE
 from calib.twin.rig import SimulatedRig
@@ -223,7 +222,7 @@ def misaligned(folder: Path, rig: SimulatedRig) -> tuple[float, float]:
     found = Rig.load(folder / "rig.yaml").align
     assert found is not None
     late = found.time_offset_s - rig.tracker.latency_s
-    turned = found.rest_angle_rad - rest_angle(truth_of_sensors(rig))[0]
+    turned = found.rest_angle_rad - rest_reading(truth_of_sensors(rig))[0][0]
     return 1e3 * abs(late), float(np.degrees(abs(turned)))
 
 

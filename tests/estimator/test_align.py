@@ -47,7 +47,6 @@ from calib.stages.align.solve import (
     pixel_terms,
     readings_off,
     repeating,
-    rest_angle,
     solve,
     start,
     turned,
@@ -64,7 +63,14 @@ from calib.stages.align.spline import (
     states_of,
 )
 from calib.stages.camera.section import Camera, Distortion, Plane
-from calib.stages.estimator.sensors import SENSOR, SIZE, sensor_values, view_coefficients
+from calib.stages.estimator.sensors import (
+    SENSOR,
+    SIZE,
+    accelerometer,
+    rest_reading,
+    sensor_values,
+    view_coefficients,
+)
 from calib.twin.rig import SimulatedRig, nominal_view
 
 OFFSET, MOUNT, BIAS = (
@@ -263,7 +269,7 @@ def test_sigma_holds_what_is_another_in_one_log(
     assert verdict.word == word
     assert any(words in one for one in verdict.remarks) if words else not found.apart
     assert np.abs(scores(trial, found)).max() < 3.0
-    true_rest = rest_angle(trial.truth)[0]
+    true_rest = rest_reading(trial.truth)[0][0]
     assert abs(found.rest_angle_rad - true_rest) < 3.0 * found.rest_angle_sigma
 
 
@@ -339,7 +345,7 @@ def test_a_sensor_that_still_shows_the_hand_as_a_swing_begins_does_not_turn_the_
     found = align(logs, replace(settings, sigma=sigma, aside_sigma_m=(5e-5, 1e-5)))
     assert judge(found).word == "ok"
     assert found.rest_angle_sigma < math.radians(0.05)
-    assert abs(found.rest_angle_rad - rest_angle(trial.truth)[0]) < 3.0 * found.rest_angle_sigma
+    assert abs(found.rest_angle_rad - rest_reading(trial.truth)[0][0]) < 3.0 * found.rest_angle_sigma
     (late,) = (one for one in found.apart if one.log < 0)
     assert late.away == pytest.approx(math.sqrt(0.5) / math.pi * (1 / 62.5 - 1 / 47.0), rel=0.2)
 
@@ -439,18 +445,20 @@ def test_the_jerk_of_a_pump_is_no_scale() -> None:
     assert np.abs(scores(trial, found)).max() < 3.0
 
 
-def test_the_angle_at_rest_and_its_gradient() -> None:
+def test_what_is_read_at_rest_and_its_gradients() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         sensor = rng.normal(0.0, 1.0, len(SENSOR)) * 0.05
-        angle, gradient = rest_angle(sensor)
+        (angle, size), gradients = rest_reading(sensor)
         for k in range(len(SENSOR)):
             ahead, back = sensor.copy(), sensor.copy()
             ahead[k] += 1e-6
             back[k] -= 1e-6
-            slope = (rest_angle(ahead)[0] - rest_angle(back)[0]) / 2e-6
-            assert gradient[k] == pytest.approx(slope, abs=1e-7)
-        assert abs(angle) < 0.5
+            slope = (np.array(rest_reading(ahead)[0]) - rest_reading(back)[0]) / 2e-6
+            assert gradients[:, k] == pytest.approx(slope, abs=1e-7)
+        state = np.concatenate([[0.0, 0.07], np.zeros(4), sensor])
+        read = accelerometer(state, np.zeros(20), np.zeros(20))
+        assert (math.hypot(*read), math.atan2(read[1], read[0])) == pytest.approx((size, angle))
 
 
 @pytest.mark.slow

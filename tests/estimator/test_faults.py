@@ -15,16 +15,14 @@ from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log
 from calib.io.sensor_faults import Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
-from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive, Handover
+from calib.stages.estimator.driven import Drive, Handover
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import READINGS
 from calib.stages.estimator.replay import (
     captured,
     consistent,
     contradicting,
-    grown,
     jumped,
-    leaning,
     sampled,
     untimely,
 )
@@ -150,39 +148,17 @@ def test_a_late_column_is_named(scenario: str, late: tuple[str, ...], samples: i
     assert told in finding.text
 
 
-@pytest.mark.parametrize(
-    ("scenario", "far_px"),
-    [("static", 2.0), ("swing", 0.0), ("ellipse", 2.0), ("step", 4.0), ("elongation", 4.0)],
-)
-def test_an_angle_that_gravity_contradicts_is_told(scenario: str, far_px: float) -> None:
-    """Pictures two pixels aside, as of a camera that was moved: the angle is 2 degrees off. It takes more
-    in 10 s than in 20, and a swing is too short to tell.
-    """
+@pytest.mark.parametrize("scenario", ["static", "swing", "ellipse", "step", "elongation"])
+def test_an_angle_that_gravity_contradicts_is_told(scenario: str) -> None:
+    """Pictures two pixels aside, as of a camera that was moved: the angle is 2 degrees off."""
     _, log = driven_log(scenario)
     setup = setup_for(varied_drive(0))
-    for aside_px in (0.0, far_px):
+    for aside_px in (0.0, 2.0):
         moved = replace(log, columns={**log.columns, "u_px": log.columns["u_px"] + aside_px})
-        tally = Tally(0.0126)
-        tally.add(Handover(setup, Drive()).run(rows_from(moved)))
-        told = [one.text for one in leaning(setup, tally)]
-        assert bool(told) == (aside_px > 0.0), told
-
-
-@pytest.mark.parametrize("scenario", ["static", "ellipse"])
-def test_a_camera_that_moved_along_the_actuator_is_told(scenario: str) -> None:
-    """Pictures two pixels along it: q1 and q2 are 2 mm off, ten deviations, and nothing else tells."""
-    _, log = driven_log(scenario)
-    setup = setup_for(varied_drive(0))
-    sigma = np.array(SIGMA)
-    sigma[PARAMETER.index("rest_length_m")] = 3.5e-4
-    drive = Drive(sigma=tuple(sigma), covariance=np.diag(sigma**2))
-    for along_px in (0.0, -2.0, 2.0):
-        moved = replace(log, columns={**log.columns, "v_px": log.columns["v_px"] + along_px})
-        estimate = Handover(setup, drive)
+        estimate = Handover(setup, Drive())
         estimate.run(rows_from(moved))
-        longer_m, sigma_m = estimate.longer_m
-        assert bool(list(grown(longer_m, sigma_m))) == (along_px != 0.0), longer_m
-        assert along_px * longer_m >= 0.0
+        told = [one.text for one in contradicting(setup, estimate.sensor, float(np.ptp(log.t_s)))]
+        assert bool(told) == (aside_px > 0.0), told
 
 
 @pytest.mark.parametrize("size", [3, 12])

@@ -37,7 +37,16 @@ from calib.stages.align.spline import (
     imu_rows,
     normal_sums,
 )
-from calib.stages.estimator.sensors import GRAVITY_MPS2, HEAD, QUANTITIES, SENSOR, SIZE, heads_seen, truncated
+from calib.stages.estimator.sensors import (
+    GRAVITY_MPS2,
+    HEAD,
+    QUANTITIES,
+    SENSOR,
+    SIZE,
+    heads_seen,
+    rest_reading,
+    truncated,
+)
 
 # ----------------------------------------------------------------------
 # How well readings fit: whole pixels with outliers, and readings of the IMU.
@@ -1151,28 +1160,13 @@ class Alignment:
     @property
     def rest_angle_rad(self) -> float:
         """What the accelerometer reads at phi = 0 at rest."""
-        return rest_angle(self.sensor)[0]
+        return rest_reading(self.sensor)[0][0]
 
     @property
     def rest_angle_sigma(self) -> float:
         """Standard deviation of that."""
-        gradient = rest_angle(self.sensor)[1]
+        gradient = rest_reading(self.sensor)[1][0]
         return math.sqrt(float(gradient @ self.covariance @ gradient))
-
-
-def rest_angle(sensor: FloatArray) -> tuple[float, FloatArray]:
-    """Angle that the accelerometer reads at phi = 0 at rest, and its gradient (14,)."""
-    alpha = sensor[_MOUNT]
-    ca, sa = math.cos(alpha), math.sin(alpha)
-    x = (1.0 + sensor[_SX]) * GRAVITY_MPS2 * ca + sensor[_AX]
-    y = (1.0 + sensor[_SY]) * GRAVITY_MPS2 * sa + sensor[_AY]
-    square = x * x + y * y
-    by_x, by_y = -y / square, x / square
-    gradient = np.zeros(len(SENSOR))
-    gradient[_AX], gradient[_AY] = by_x, by_y
-    gradient[_SX], gradient[_SY] = by_x * GRAVITY_MPS2 * ca, by_y * GRAVITY_MPS2 * sa
-    gradient[_MOUNT] = GRAVITY_MPS2 * (by_y * (1.0 + sensor[_SY]) * ca - by_x * (1.0 + sensor[_SX]) * sa)
-    return math.atan2(y, x), gradient
 
 
 _LEAST_STEP_S, _OFF_GRID = 2e-3, 0.15

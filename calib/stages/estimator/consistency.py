@@ -112,8 +112,6 @@ class Tally:
     squares: FloatArray = field(default_factory=lambda: np.zeros(7))
     jump: tuple[float, float] = (0.0, math.nan)
     """Where the pictures jump most, in deviations of what innovations sum up to, and when [s]."""
-    across: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """Innovations of the accelerometer across the head [m/s^2] summed up, and their number."""
 
     def add(
         self, out: FloatArray, truth: FloatArray | None = None, marker_px: FloatArray | None = None
@@ -133,8 +131,6 @@ class Tally:
         late = out[:, 0] >= self.start_s + SETTLED_S
         for name in SENSORS:
             self._add_sensor(name, out[late])
-        across = out[late][out[late, OUT.index("gated_accel")] == 0.0, OUT.index("e_ay")]
-        self.across += float(across.sum()), len(across)
         if marker_px is not None:
             self._add_jump(out[late], marker_px[late])
         if truth is not None:

@@ -741,8 +741,8 @@ FASTEST_MPS = 1.0
 """No rig's bellows change their lengths faster: a swing from 0.7 rad reaches a quarter of it."""
 _SILENT_S = 0.5
 _LOCKED_OUT_S = 0.5
-_KNOWN_M = 0.05
-"""A length with a larger deviation than this is as good as unknown."""
+_KNOWN_M = 0.012
+"""A length with a larger deviation than this is as good as unknown: the prior holds it within 12 to 23 mm."""
 _LAST, _CAMERA_SEEN, _IMU_SEEN, _REJECTED_SINCE, _GYRO_REJECTED_SINCE = range(5)
 _CAMERA_STARTED, _PENDING = 2, 3
 _PHI, _LENGTH = 0, 1
@@ -792,10 +792,8 @@ def _mend(
         x, P = bank.x[slot, m], bank.P[slot, m]
         if P[0, 0] > 1.0:
             _hold(x, P, int(_PHI), head[0], 0.7, p)
-            flags |= 8
         if P[1, 1] > 2.25 * head_sigma[1] * head_sigma[1]:
             _hold(x, P, int(_LENGTH), head[1], head_sigma[1], p)
-            flags |= 8
         bad = not (abs(x[0]) < 3.0 and 1e-3 < x[1] < 1.0)
         for i in range(SIZE):
             bad = bad or not (abs(x[i]) < 1e6 and P[i, i] > 0.0)
@@ -1085,9 +1083,6 @@ def starting_state(setup: Setup, rows: Rows | None = None) -> tuple[FloatArray, 
 
 class Filter:
     """A filter at work: rows in, estimates out, with memory of the last events only."""
-
-    longer_m = None
-    """As of `driven.DrivenFilter`, whose plant alone has a length at rest."""
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup

@@ -461,16 +461,6 @@ def noise_at_rest(rig: Rig, found: Periods) -> tuple[float, float, float] | None
     return x, y, z
 
 
-def quiet_shares(rig: Rig, found: Periods) -> dict[str, float]:
-    """By sensor the variance of its noise at rest over that of the filter, at most 1; empty if not known."""
-    moving = _noise(rig, found)
-    shares = {key: min((one / moving[key]) ** 2, 1.0) for key, one in _at_rest(rig, found).items()}
-    sensors = {"accel": ("accel_x_mps2", "accel_y_mps2"), "gyro": ("gyro_radps",)}
-    return {
-        name: min(shares[key] for key in keys) for name, keys in sensors.items() if shares.keys() >= set(keys)
-    }
-
-
 def setup_from_rig(rig: Rig, path: Path, found: Periods) -> tuple[Setup, list[str]]:
     """The estimator's set-up, and sentences about what is assumed.
 

@@ -221,6 +221,28 @@ def sensor_values(values: dict[str, float]) -> FloatArray:
     return np.array([values.get(name, 0.0) for name in SENSOR], dtype=np.float64)
 
 
+def rest_reading(sensor: FloatArray) -> tuple[tuple[float, float], FloatArray]:
+    """Angle [rad] and size [m/s^2] that the accelerometer reads at phi = 0 at rest, with gradients (2, 14).
+
+    Mount angle, biases and scales turn and stretch it; logs tell it far better than each of them.
+    """
+    value = dict(zip(SENSOR, sensor.tolist(), strict=True))
+    gx, gy = (GRAVITY_MPS2 * one(value["mount_angle_rad"]) for one in (math.cos, math.sin))
+    x = (1.0 + value["accel_scale_x"]) * gx + value["accel_bias_x_mps2"]
+    y = (1.0 + value["accel_scale_y"]) * gy + value["accel_bias_y_mps2"]
+    by = {
+        "accel_bias_x_mps2": (1.0, 0.0),
+        "accel_bias_y_mps2": (0.0, 1.0),
+        "accel_scale_x": (gx, 0.0),
+        "accel_scale_y": (0.0, gy),
+        "mount_angle_rad": (-(1.0 + value["accel_scale_x"]) * gy, (1.0 + value["accel_scale_y"]) * gx),
+    }
+    size = math.hypot(x, y)
+    each = np.array([by.get(name, (0.0, 0.0)) for name in SENSOR]).T
+    turn = np.array([[-y / size**2, x / size**2], [x / size, y / size]])
+    return (math.atan2(y, x), size), turn @ each
+
+
 @kernel(arrays=False)
 def head_position(phi: float, length: float) -> tuple[float, float]:
     """Head (x, y) [m] of angle and length (3.6)."""
