@@ -38,6 +38,7 @@ from calib.core.verdict import Finding
 from calib.core.words import BLANK, InWords, Line, Table, all_of, counted, several
 from calib.core.words import Block as Words
 from calib.core.writing import Kind, column_names, write_atomically
+from calib.io import tables
 from calib.io.columns import (
     COLUMNS,
     IMU,
@@ -54,17 +55,7 @@ from calib.io.columns import (
 )
 from calib.io.inferred_units import infer_units
 from calib.io.sensor_faults import FEWEST, Watch, at_range_end, marker_places
-from calib.io.tables import (
-    ALL_TAKEN,
-    GENERAL,
-    TIME,
-    Block,
-    Passed,
-    open_text,
-    parquet_blocks,
-    table_bytes,
-    text_blocks,
-)
+from calib.io.tables import Block, Passed
 from calib.solve.clock import SPLIT_S, TimeAxis, time_axis
 
 _MOST_CELLS = 200_000_000
@@ -98,7 +89,7 @@ class Log(InWords):
     lines: IntArray
     map: ColumnMap | None = None
     unknown: tuple[str, ...] = ()
-    passed: Passed = ALL_TAKEN
+    passed: Passed = tables.ALL_TAKEN
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -319,11 +310,11 @@ def iter_rows(
     ----------
     path : where it lies, beside which columns.yaml is looked for.
     """
-    yield from _in_si(*text_blocks(stream, source, path or Path(source), options))
+    yield from _in_si(*tables.text_blocks(stream, source, path or Path(source), options))
 
 
 def _iter_csv(path: Path, options: LogOptions) -> Iterator[Log]:
-    with to_be("read", path), open_text(path) as stream:
+    with to_be("read", path), tables.open_text(path) as stream:
         yield from iter_rows(stream, shown(path), path, options)
 
 
@@ -386,8 +377,10 @@ def iter_log(
         blocks = _iter_bag(path, options)
     elif ending in STREAMS:
         blocks = iter_rows(io.BytesIO(stream_text(path).encode()), shown(path))
+    elif ending == ".parquet":
+        blocks = _in_si(*tables.parquet_blocks(path, options))
     else:
-        blocks = _in_si(*parquet_blocks(path, options)) if ending == ".parquet" else _iter_csv(path, options)
+        blocks = _iter_csv(path, options)
     if as_it_is:
         return blocks
     return (
@@ -406,8 +399,8 @@ def read_column_names(path: Path, options: LogOptions = NOTHING_STATED) -> tuple
         if is_bag(path) or path.suffix.lower() in (".parquet", *STREAMS):
             return tuple(next(iter_log(path, options)).columns)
         check_readable(path)
-        with open_text(path) as stream:
-            columns, _ = text_blocks(stream, shown(path), path, options)
+        with tables.open_text(path) as stream:
+            columns, _ = tables.text_blocks(stream, shown(path), path, options)
         return tuple(name for name in columns.sources if name != "t_s")
     except (BadInputError, OSError, StopIteration):
         return None
@@ -448,7 +441,7 @@ def read_log(
         t_s=np.concatenate([block.t_s for block in blocks]),
         columns={name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns},
         lines=np.concatenate([block.lines for block in blocks]),
-        passed=sum((block.passed for block in blocks), ALL_TAKEN),
+        passed=sum((block.passed for block in blocks), tables.ALL_TAKEN),
     )
     log = sort_rows(log)
     if remarks is not None:
@@ -503,8 +496,8 @@ def log_text(log: Log) -> str:
     """
     names = [name for name in COLUMNS if name in log.columns]
     values = np.column_stack([log.t_s, *(log.columns[name] for name in names)])
-    kinds = [TIME] + [GENERAL] * len(names)
-    return ",".join(["t_s", *names]) + "\n" + table_bytes(values, kinds).decode()
+    kinds = [tables.TIME] + [tables.GENERAL] * len(names)
+    return ",".join(["t_s", *names]) + "\n" + tables.table_bytes(values, kinds).decode()
 
 
 def _parquet_bytes(log: Log) -> bytes:

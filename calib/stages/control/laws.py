@@ -10,25 +10,10 @@ import numpy as np
 from calib.core.arrays import FloatArray
 from calib.stages.actuator import dynamics
 from calib.stages.actuator.parameters import TICK_S
-from calib.stages.actuator.pump import (
-    PWM_MAX,
-)
+from calib.stages.actuator.pump import PWM_MAX
+from calib.stages.control import rig_model
 from calib.stages.control.observer import Observer
-from calib.stages.control.rig_model import (
-    PWM_MIN,
-    Model,
-    Pair,
-    ahead,
-    creep_along,
-    falling_rate,
-    largest_force_N,
-    least_pwm,
-    moving_force,
-    pumps_at_rest,
-    push,
-    pwm_for_force,
-    pwm_of_force,
-)
+from calib.stages.control.rig_model import PWM_MIN, Model, Pair
 
 # ----------------------------------------------------------------------
 # The discrete PID controller with integrator clamping (4.4, D.1 - D.9).
@@ -158,7 +143,7 @@ class BackOrientation:
     ) -> None:
         self.tracking_s, self.model = tracking_s, model
         self.falling_share, self.sign = falling_share, sign
-        self.pumps = pumps_at_rest(model)
+        self.pumps = rig_model.pumps_at_rest(model)
         self.channels = Channel(pid), Channel(pid)
 
     def step(self, phi_ref_rad: float, phi_rad: float) -> Pair:
@@ -166,13 +151,13 @@ class BackOrientation:
         model, error = self.model, self.sign * (phi_ref_rad - phi_rad)
         low, high = (model.low_pwm, model.low_pwm), model.high_pwm
         if math.isfinite(self.falling_share):
-            low = least_pwm(model, ahead(model, self.pumps)[-1], self.falling_share)
+            low = rig_model.least_pwm(model, rig_model.ahead(model, self.pumps)[-1], self.falling_share)
         u1, u2 = (
             step_back(channel, e, least, high, self.tracking_s)
             for channel, e, least in zip(self.channels, (error, -error), low, strict=True)
         )
         pwm = saturate(u1, model.low_pwm, high), saturate(u2, model.low_pwm, high)
-        self.pumps = push(model, self.pumps, pwm)
+        self.pumps = rig_model.push(model, self.pumps, pwm)
         return pwm
 
 
@@ -275,8 +260,8 @@ def wanted_motion(model: Model, q_m: FloatArray) -> WantedMotion:
     dq = np.gradient(q, h, axis=0)
     ddq = np.zeros_like(q)
     ddq[1:-1] = (q[2:] - 2.0 * q[1:-1] + q[:-2]) / h**2
-    z = creep_along(model.plant, h, dq)
-    return WantedMotion(q, dq, z, moving_force(model.plant, q, dq, ddq, z))
+    z = rig_model.creep_along(model.plant, h, dq)
+    return WantedMotion(q, dq, z, rig_model.moving_force(model.plant, q, dq, ddq, z))
 
 
 def computed_torque_step(
@@ -300,13 +285,13 @@ def computed_torque_step(
         v = control.Kp_per_s2 * (wanted.q_m[arrives] - y[:2])
         v = v + control.Kd_per_s * (wanted.dq_mps[arrives] - y[2:4])
         force = force + dynamics.mass_matrix(model.plant, y[:2]) @ v
-    pwm = pwm_for_force(model, pumps, force, control.horizon_ticks)
+    pwm = rig_model.pwm_for_force(model, pumps, force, control.horizon_ticks)
     F = np.array(pumps.force_N)
-    lowest = np.maximum(F - T * falling_rate(model, F), 0.0)
+    lowest = np.maximum(F - T * rig_model.falling_rate(model, F), 0.0)
     limited = (
-        (pwm >= pwm_of_force(model, largest_force_N(model)))
+        (pwm >= rig_model.pwm_of_force(model, rig_model.largest_force_N(model)))
         | (force < lowest - 1e-3)
-        | (force > largest_force_N(model))
+        | (force > rig_model.largest_force_N(model))
     )
     u1, u2 = (saturate(u, model.low_pwm, model.high_pwm) for u in pwm.tolist())
     return (u1, u2), bool(limited.any())

@@ -41,14 +41,7 @@ from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
 from calib.stages.actuator import dynamics, kinematics
 from calib.stages.actuator.parameters import Plant
-from calib.stages.actuator.pump import (
-    PWM_MAX,
-    Orifice,
-    Pump,
-    advance_pump,
-    pump_coefficients,
-    static_force_N,
-)
+from calib.stages.actuator.pump import PWM_MAX, Orifice, Pump, advance_pump, pump_coefficients, static_force_N
 
 PWM_MIN = 0.0
 """Limits of what the microcontroller can put out, 0 V to 12 V, with `PWM_MAX`."""

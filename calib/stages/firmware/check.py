@@ -19,19 +19,12 @@ from calib.core.files import read_bytes, shown
 from calib.core.verdict import Finding, Verdict
 from calib.core.words import Block, InWords, Line, Table, counted, of_verdict
 from calib.io.serial import BOARD_COLUMNS, FAULTS, GUARD_RUN, Frame, Outputs, frame_from_row
-from calib.stages.firmware.conformance import (
-    BY_FUSED,
-    BY_MEAN_RATE,
-    CLAMPED,
-    MARKER_HELD,
-    Reference,
-    Wanted,
-    make_reference,
-)
+from calib.stages.firmware import conformance
+from calib.stages.firmware.conformance import Reference, Wanted
 from calib.stages.firmware.header import Header
 from calib.stages.firmware.vectors import TOLERANCE, tolerance
 
-_CLAMP_BITS = CLAMPED[0] | CLAMPED[1]
+_CLAMP_BITS = conformance.CLAMPED[0] | conformance.CLAMPED[1]
 _UNDECIDED_M = 1e-6
 """What rounding makes of the fused estimator's residuals after a long rest."""
 
@@ -131,10 +124,11 @@ def _reference_for(header: Header, first: Frame, source: str) -> Reference:
         raise BadInputError(
             f"{source}: begins with tick {first.sequence}, expected 0: record from the board's start"
         )
-    fused, mean_rate = bool(first.out.flags & BY_FUSED), bool(first.out.flags & BY_MEAN_RATE)
+    flags = first.out.flags
+    fused, mean_rate = bool(flags & conformance.BY_FUSED), bool(flags & conformance.BY_MEAN_RATE)
     if fused and not header.values["CALIB_HAS_FUSED"]:
         raise BadInputError(f"{source}: the board runs the fused estimator, for which rig.yaml has no gains")
-    return make_reference(header.values, fused=fused, mean_rate=mean_rate)
+    return conformance.make_reference(header.values, fused=fused, mean_rate=mean_rate)
 
 
 def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
@@ -157,7 +151,7 @@ def check_frames(header: Header, frames: Sequence[Frame], source: str) -> Check:
             missing_after = tick
             break
         wanted = reference.step(frame.given, frame.out.flags)
-        if not wanted.flags & MARKER_HELD:
+        if not wanted.flags & conformance.MARKER_HELD:
             # Low-pass and controller remember it.
             rounding_m = max(rounding_m, reference.rounding_m(frame.given.u_px, frame.given.v_px))
             allowed = tolerance(rounding_m)

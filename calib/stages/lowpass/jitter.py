@@ -11,16 +11,8 @@ import numpy as np
 
 from calib.core.arrays import FloatArray
 from calib.core.errors import BadInputError
-from calib.stages.lowpass.filters import (
-    FAMILIES,
-    LARGEST_ORDER,
-    Design,
-    Filter,
-    dc_delay_s,
-    design_lowpass,
-    frequency_response,
-    noise_gain,
-)
+from calib.stages.lowpass import filters
+from calib.stages.lowpass.filters import Design, Filter
 
 # ----------------------------------------------------------------------
 # Samples with time stamps as the firmware sees them: one value per tick.
@@ -220,8 +212,8 @@ def _smoothed(P: FloatArray) -> FloatArray:
 
 def jitter_after(of: Spectrum, sections: FloatArray) -> float:
     """Standard deviation of the jitter behind a filter; the floor's part exactly, the rest by the sum."""
-    H2 = np.abs(frequency_response(sections, of.f_hz, of.rate_hz)) ** 2
-    return math.sqrt(_jitter_power(of, H2, noise_gain(sections)))
+    H2 = np.abs(filters.frequency_response(sections, of.f_hz, of.rate_hz)) ** 2
+    return math.sqrt(_jitter_power(of, H2, filters.noise_gain(sections)))
 
 
 def _jitter_power(of: Spectrum, H2: FloatArray, gain: float) -> float:
@@ -239,7 +231,7 @@ def motion_lost(of: Spectrum, sections: FloatArray, delay_s: float) -> float:
     M = of.motion_density
     if not np.any(M > 0.0):
         return 0.0
-    H = frequency_response(sections, of.f_hz, of.rate_hz)
+    H = filters.frequency_response(sections, of.f_hz, of.rate_hz)
     error = np.abs(H - np.exp(-2j * np.pi * of.f_hz * delay_s)) ** 2
     return math.sqrt(float(np.sum(M * error) / np.sum(M)))
 
@@ -328,7 +320,7 @@ def _candidate(spectra: Sequence[Spectrum], wanted: float, order: int, family: s
     rate = spectra[0].rate_hz
 
     def at(cutoff_hz: float) -> Filter:
-        return design_lowpass(Design(cutoff_hz, rate, order, family))
+        return filters.design_lowpass(Design(cutoff_hz, rate, order, family))
 
     low, high = _LOWEST * rate, _HIGHEST * rate
     try:
@@ -348,7 +340,7 @@ def _candidate(spectra: Sequence[Spectrum], wanted: float, order: int, family: s
     else:
         low = high
     filter_ = at(_three_digits_below(low))
-    delay_s = dc_delay_s(filter_.sections, rate)
+    delay_s = filters.dc_delay_s(filter_.sections, rate)
     lost = max(motion_lost(one, filter_.sections, delay_s) for one in spectra)
     return Candidate(filter_, delay_s, _worst(spectra, filter_), lost)
 
@@ -392,9 +384,9 @@ def suggest(
         )
     found = [
         _candidate(spectra, wanted, order, family)
-        for order in (orders or range(1, LARGEST_ORDER + 1))
+        for order in (orders or range(1, filters.LARGEST_ORDER + 1))
         # The families differ from the second order on.
-        for family in (families or (FAMILIES if order > 1 or orders else FAMILIES[:1]))
+        for family in (families or (filters.FAMILIES if order > 1 or orders else filters.FAMILIES[:1]))
     ]
     candidates = sorted((one for one in found if one is not None), key=lambda one: one.delay_s)
     if not candidates:
