@@ -531,12 +531,12 @@ def write_log(path: Path, log: Log, kind: Kind | None = None) -> None:
 
 
 # ----------------------------------------------------------------------
-# Signals: the readings of a log as arrays, and what is wrong about the sensors that they come from.
+# Signals: the readings of a log as arrays.
 #
 # `Log.signals` is the way from a log to arrays. It takes the rows in which all the columns that are asked for
 # have a reading, drops rows that were written twice, and holds the samples' times to the stamps
-# (`calib.solve.clock`). What it finds of sensors that are stuck, absent or turned the wrong way are findings
-# for the verdict of whoever uses them; `Watch` finds the same block by block in a log that is streamed.
+# (`calib.solve.clock`). What it finds of sensors that are stuck, absent or turned the wrong way
+# (`calib.io.sensor_faults`) are findings for the verdict of whoever uses them.
 
 
 @dataclass(frozen=True, repr=False)

@@ -1,4 +1,15 @@
-"""The simulated rig at work: plant, pumps, sensors and controller, tick by tick, and the log of it."""
+"""The simulated rig at work: plant, pumps, sensors and controller, tick by tick, and the log of it.
+
+At tick k the controller gets what it sees at that moment, its command starts its way to the pumps,
+and the plant moves on to tick k + 1. What it sees is either the truth or what the firmware has made
+of the sensors' readings by then (`calib.stages.estimator.baseline`): the IMU samples up to the tick,
+and the camera's picture that was exposed one latency earlier. Latency, bias, mount angle and lens are not
+corrected there, so that a loop closed over these values errs as the real one does. Without a controller
+the commands are known beforehand and all ticks are run at once.
+
+The log has one row per tick, with the marker and the commands given in that tick, and one per IMU
+sample in between. Its true_* columns are the state at the row's own time stamp.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +40,6 @@ from calib.twin.sensors import (
     onchip_angle_rad,
     track,
 )
-
-# ----------------------------------------------------------------------
-# The simulated rig at work: plant, pumps, sensors and controller, tick by tick, and the log of it.
-#
-# At tick k the controller gets what it sees at that moment, its command starts its way to the pumps,
-# and the plant moves on to tick k + 1. What it sees is either the truth or what the firmware has made
-# of the sensors' readings by then (`calib.stages.estimator.baseline`): the IMU samples up to the tick,
-# and the camera's picture that was exposed one latency earlier. Latency, bias, mount angle and lens are not
-# corrected there, so that a loop closed over these values errs as the real one does. Without a controller
-# the commands are known beforehand and all ticks are run at once.
-#
-# The log has one row per tick, with the marker and the commands given in that tick, and one per IMU
-# sample in between. Its true_* columns are the state at the row's own time stamp.
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,13 @@
-"""The C's arithmetic in double precision, operation by operation, to hold the C against."""
+"""What the firmware has to compute, in float64: the reference that C, AVR and boards are held against.
+
+It takes the constants of a header as a compiler reads them, rounded to binary32, and inputs in the same
+precision, so that what differs is the firmware's own rounding and its polynomials alone. Those it does not
+share: angle, sine and cosine are the library's here. The order of decisions is that of `calib_pipeline.h`.
+
+Decisions on computed values (integration left out or not) can fall either way when the value lies within
+rounding of the limit. `step` therefore takes what the firmware decided, and reports how far its own value
+was from the limit where it would have decided otherwise.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +18,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs, Outputs
-
-# ----------------------------------------------------------------------
-# What the firmware has to compute, in float64: the reference that C, AVR and boards are held against.
-#
-# It takes the constants of a header as a compiler reads them, rounded to binary32, and inputs in the same
-# precision, so that what differs is the firmware's own rounding and its polynomials alone. Those it does not
-# share: angle, sine and cosine are the library's here. The order of decisions is that of `calib_pipeline.h`.
-#
-# Decisions on computed values (integration left out or not) can fall either way when the value lies within
-# rounding of the limit. `step` therefore takes what the firmware decided, and reports how far its own value
-# was from the limit where it would have decided otherwise.
 
 MARKER_HELD, HORIZON, IMU_HELD, ACCEL_WEAK = 0x1, 0x2, 0x4, 0x8
 ANGLE_LIMIT, STALE, BAD_REFERENCE = 0x10, 0x20, 0x40
