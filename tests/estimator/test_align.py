@@ -27,6 +27,8 @@ from calib.stages.align.read import align_log as read_for_alignment
 from calib.stages.align.read import settings_from_rig
 from calib.stages.align.section import Align
 from calib.stages.align.solve import (
+    _LEAN_RAD,
+    _SKEW,
     ASIDE_M,
     AlignLog,
     Alignment,
@@ -37,8 +39,10 @@ from calib.stages.align.solve import (
     _beside,
     _centred,
     _from_axis,
-    _leant,
+    _likely,
     _own,
+    _skewed,
+    _turned_motion,
     align,
     best_jitter_px,
     judge,
@@ -639,22 +643,28 @@ def test_turned_axes_move_the_quantities_as_a_fit_to_them_does() -> None:
     assert np.all(np.abs(moved - expected) < 0.1 * expected + 0.03 * np.sqrt(np.diag(fit.covariance)))
 
 
-def test_gravity_aside_moves_the_quantities_as_a_fit_to_it_does() -> None:
-    """The head's motion comes turned beside gravity; the IMU seemed to sit aside, by ten deviations."""
+@pytest.mark.parametrize("way", ["gravity aside", "axes askew"])
+def test_what_no_quantity_stands_for_moves_the_others_as_a_fit_to_it_does(way: str) -> None:
+    """The IMU seemed to sit aside by ten deviations, and scales are off by five."""
     problem, c = _problem(noisy=True)
-    fit, stretch, lean = solve(problem, MEAN, NOISE), problem.stretches[0], 4e-3
-    span, basis = basis_rows(stretch.knots, stretch.imu_s)
-    angle = np.einsum("nj,nj->n", basis[:, 0], c[span[:, None] + np.arange(6), 0]) + TRUTH[MOUNT]
-    resting = TRUTH[1:3] + 9.81 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    fit, stretch = solve(problem, MEAN, NOISE), problem.stretches[0]
     readings = stretch.readings.copy()
-    back = np.array([[math.cos(lean), math.sin(lean)], [-math.sin(lean), math.cos(lean)]])
-    readings[:, :2] = resting + (readings[:, :2] - resting) @ back
-    leant = replace(problem, stretches=(replace(stretch, readings=readings),))
-    again = solve(leant, fit.sensor, fit.noise)
-    moved, covariance = again.sensor - fit.sensor, _leant(leant, again)
-    at = SENSOR.index("imu_across_m")
-    assert abs(moved[at]) > 1e-4
-    spread = np.sqrt(np.diag(covariance))
+    if way == "gravity aside":
+        span, basis = basis_rows(stretch.knots, stretch.imu_s)
+        angle = np.einsum("nj,nj->n", basis[:, 0], c[span[:, None] + np.arange(6), 0]) + TRUTH[MOUNT]
+        resting = TRUTH[1:3] + 9.81 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        back = np.array([[math.cos(4e-3), math.sin(4e-3)], [-math.sin(4e-3), math.cos(4e-3)]])
+        readings[:, :2] = resting + (readings[:, :2] - resting) @ back
+        column, sigma, most, least = _turned_motion, _LEAN_RAD, "imu_across_m", 1e-4
+    else:
+        readings[:, 1] += 4e-3 * (readings[:, 0] - 9.81)
+        column, sigma, most, least = _skewed, _SKEW, "accel_scale_y", 1e-3
+    other = replace(problem, stretches=(replace(stretch, readings=readings),))
+    again = solve(other, fit.sensor, fit.noise)
+    moved = again.sensor - fit.sensor
+    at = SENSOR.index(most)
+    assert abs(moved[at]) > least
+    spread = np.sqrt(np.diag(_likely(other, again, partial(column, again), sigma)))
     assert np.all(np.abs(moved) < 1.5 * spread + 0.1 * np.sqrt(np.diag(fit.covariance)))
     assert spread[at] < 2.5 * abs(moved[at])
 
