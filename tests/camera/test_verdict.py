@@ -84,6 +84,15 @@ def test_pixels_that_are_not_square_are_told_from_squares() -> None:
     assert any("the pixels, not the squares" in one for one in found.remarks)
 
 
+def test_a_cropped_picture_is_good_where_the_views_tell_its_centre() -> None:
+    camera = camera_of(off_centre_px=(130.0, -40.0))
+    views = take(np.random.default_rng(0), camera, 12)
+    fit, found = _judged(views, camera.image_size_px, "radial2")
+    assert found.word == "ok", found.reasons
+    assert any("the picture is cropped" in one for one in found.remarks)
+    assert abs(fit.camera.cx_px - camera.cx_px) < 3 * covariance(fit).sigma()["cx_px"]
+
+
 def test_a_lens_that_is_not_one_to_one_over_the_picture_is_poor_by_name_and_no_candidate() -> None:
     # Noise fits a pole into the picture, with a zero next to it: the RMS is as good as any.
     views, camera = good_set(3, "rational8")

@@ -46,7 +46,8 @@ class Limits:
     view_poor : share of the image that a typical view spans.
     projection_share : standard deviation of projection inside of what was seen, over the width.
     border_share : the same at the picture's border; poor where half of it is worse.
-    centre_poor, centre_remark : offset of the principal point from the image's centre, over its side.
+    centre_poor, centre_remark : offset of the principal point from the image's centre, over its side; of a
+        cropped picture it may be larger.
     lens_remark, lens_poor, lens_poor_px : share, and pixels, of the RMS that a richer lens model would
         take away.
     rms_px : residuals above which something is wrong whatever it is, at up to 1000 pixels' width.
@@ -446,11 +447,9 @@ def _radius_share(calibration: bundle.Calibration) -> float:
     return float(np.linalg.norm(seen - camera.centre_px, axis=1).max() / camera.farthest_px)
 
 
-def _of_frame(calibration: bundle.Calibration) -> Iterator[Finding]:
-    """Points listed mirrored, and the principal point in the picture."""
-    camera = calibration.camera
-    # By its normal and the way to it: beside a wide lens a board's front may face away from the picture.
-    mirrored = np.einsum("ni,ni->n", calibration.block.R_CT[:, :, 2], calibration.block.t_CT_m) < 0.0
+def _of_order(calibration: bundle.Calibration) -> Iterator[Finding]:
+    """Points listed mirrored in some of the views."""
+    mirrored = _mirrored(calibration)
     if mirrored.any() and not mirrored.all():
         fewer = mirrored if mirrored.mean() <= 0.5 else ~mirrored
         names = [calibration.observations.names[i] for i in np.flatnonzero(fewer)]
@@ -459,16 +458,44 @@ def _of_frame(calibration: bundle.Calibration) -> Iterator[Finding]:
             "the other views: the points are listed in another order."
         )
         yield Finding("inconsistent", text, "Give the points of all views in the same order.")
+
+
+def _mirrored(calibration: bundle.Calibration) -> BoolArray:
+    """Which views (N,) show the board's back."""
+    # By its normal and the way to it: beside a wide lens a board's front may face away from the picture.
+    block = calibration.block
+    return np.asarray(np.einsum("ni,ni->n", block.R_CT[:, :, 2], block.t_CT_m) < 0.0)
+
+
+def _of_centre(calibration: bundle.Calibration, known: bundle.Covariance) -> Iterator[Finding]:
+    """The principal point far from the picture's centre: the picture is cropped, or something is wrong.
+
+    Views of a cropped picture tell where the principal point is, and show the board all over the picture. Of
+    a picture whose size is not as stated they show it about the principal point.
+    """
+    camera, observations = calibration.camera, calibration.observations
     width, height = size = camera.image_size_px
-    off = float(np.max(np.abs(camera.centre_px - 0.5 * (np.array(size) - 1)) / size))
-    if off > Limits.centre_remark:
-        swapped = bool(mirrored.all()) and width != height
-        why = "u and v may be swapped" if swapped else "the picture is cropped, or its size is wrong"
-        text = (
-            f"The principal point ({camera.cx_px:.0f}, {camera.cy_px:.0f}) is {100 * off:.0f} % of the "
-            f"picture's side away from its centre (up to {100 * Limits.centre_poor:.0f} is usual): {why}."
-        )
-        yield Finding("poor" if off > Limits.centre_poor or swapped else "remark", text)
+    seen = observations.pixels[observations.present]
+    away_px, away_of_seen_px = (
+        np.abs(camera.centre_px - middle)
+        for middle in (0.5 * (np.array(size) - 1), 0.5 * (seen.min(axis=0) + seen.max(axis=0)))
+    )
+    k = int(np.argmax(away_px / size))
+    off = float(away_px[k] / size[k])
+    if off <= Limits.centre_remark:
+        return
+    told = away_px[k] > checks.CERTAIN * known.sigma().get(("cx_px", "cy_px")[k], 0.0)
+    if _mirrored(calibration).all() and width != height:
+        why, usual = "u and v may be swapped", 0.0
+    elif told and away_of_seen_px[k] > 0.5 * away_px[k]:
+        why, usual = "the picture is cropped", np.inf
+    else:
+        why, usual = "the picture's size is wrong, or the views do not tell it", Limits.centre_poor
+    text = (
+        f"The principal point ({camera.cx_px:.0f}, {camera.cy_px:.0f}) is {100 * off:.0f} % of the "
+        f"picture's side away from its centre (up to {100 * Limits.centre_poor:.0f} is usual): {why}."
+    )
+    yield Finding("poor" if off > usual else "remark", text)
 
 
 def _of_misfit(calibration: bundle.Calibration) -> Iterator[Finding]:
@@ -767,7 +794,7 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
             findings.append(Finding("unidentifiable", "The solver found no camera that fits the views."))
         return findings, None
     fit = _plain(calibration)
-    findings += [*_of_coverage(fit), *_of_frame(fit)]
+    findings += [*_of_coverage(fit), *_of_order(fit)]
     if fit.degrees_of_freedom <= 0 or fit.observations.views < 2 or not np.all(np.isfinite(fit.normal)):
         return findings, None
     findings += _of_misfit(fit)
@@ -784,7 +811,7 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
     known = checks.by_the_views(calibration if sturdy is fit else sturdy)
-    findings += _of_projection(sturdy, known)
+    findings += [*_of_centre(fit, known), *_of_projection(sturdy, known)]
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = checks.widened(some)
     shape = checks.target_shape(wide)
