@@ -181,6 +181,18 @@ def test_a_board_under_a_thumb_in_every_picture(shipped: list[Path], tmp_path: P
     assert [one.name for one in covered.left_out] == [shipped[2].name]
 
 
+def test_pictures_of_another_board_say_which(shipped: list[Path], tmp_path: Path) -> None:
+    board = np.kron(np.indices((5, 7)).sum(axis=0) % 2, np.full((24, 24), 200)) + 20
+    picture = np.pad(board, ((40, 48), (60, 88)), constant_values=220).astype(np.uint8)
+    others = [tmp_path / name for name in ("a.png", "b.png")]
+    for shift, path in enumerate(others):
+        cv2.imwrite(str(path), cv2.GaussianBlur(np.roll(picture, 9 * shift), (0, 0), 1.0))
+    found = find_boards([*shipped[:3], *others], None, 0.02)
+    assert len(found.views) == 3
+    why = "shows no board with 7x5 inner corners that can be read, but one with 6x4"
+    assert [str(one) for one in found.left_out] == [f"{path.name}: {why}" for path in others]
+
+
 def test_a_file_of_several_pictures_is_named(shipped: list[Path], tmp_path: Path) -> None:
     pages = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in shipped[:3]]
     assert cv2.imwritemulti(str(tmp_path / "all.tiff"), pages)

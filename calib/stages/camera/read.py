@@ -328,6 +328,7 @@ class _Search:
     progress: Callable[[int, int], None]
     done: int = 0
     sizes: dict[int, tuple[int, int] | None] = field(default_factory=dict)
+    other: tuple[int, int] | None = None
     damaged: dict[int, LeftOut] = field(default_factory=dict)
 
     def run(self, corners: tuple[int, int] | None, dictionary: str | None) -> BoardSearch:
@@ -366,6 +367,11 @@ class _Search:
         found |= self._detect([i for i in range(count) if i not in found], wanted)
         if not any(found.values()):
             raise BadInputError(_not_found(pictures, wanted, self._common_size(sample)))
+        without = [i for i in range(count) if not found[i] and i not in self.damaged]
+        # All are asked for another board only where a few of them show one.
+        if self._common_size([i for i in sample if i in without]) is not None:
+            other = self._common_size(without, 2 / len(without))
+            self.other = None if other is None or sorted(other) == sorted(wanted) else other
         return self._search(Board(*wanted, self.square_m), found, None)
 
     def _search(
@@ -373,6 +379,10 @@ class _Search:
     ) -> BoardSearch:
         what = "ChArUco board" if layout else "board"
         why = f"shows no {what} with {board.columns}x{board.rows} inner corners that can be read"
+        reasons = dict.fromkeys(found, why)
+        if self.other is not None:
+            another = f"{why}, but one with {self.other[0]}x{self.other[1]}"
+            reasons |= {i: another for i, size in self.sizes.items() if size == self.other}
         target = board.points_m()
         seen = [(picture, detection) for i, picture in enumerate(self.pictures) if (detection := found[i])]
         unread = [i for i, detection in found.items() if layout and not detection and i not in self.damaged]
@@ -382,12 +392,13 @@ class _Search:
             )
         )
         flipped = f"shows the {what} mirrored, as a selfie camera stores it: flip it back"
+        reasons |= {i: flipped for i, is_so in mirrored.items() if is_so}
         return BoardSearch(
             board=board,
             image_size_px=self.size_px,
             views=tuple(View(p.name, target, d.pixels, d.refined) for p, d in seen),
             left_out=tuple(
-                self.damaged.get(i) or LeftOut(picture.name, flipped if mirrored.get(i) else why, "no board")
+                self.damaged.get(i) or LeftOut(picture.name, reasons[i], "no board")
                 for i, picture in enumerate(self.pictures)
                 if found[i] is None
             ),
