@@ -85,8 +85,6 @@ _WIDE = float(np.radians(40.0))
 """Angle from the axis from which on a fisheye lens is tried; below it the radial models follow its curve."""
 _SKEW_SIGMAS, _SKEW_PX = 3.0, 0.01
 """Standard deviations, and pixels by which directions move at up to 1000 pixels' width, that make a skew."""
-_DECENTRED_CHI2 = 11.8
-"""Of the two coefficients of decentering, as likely by chance as three standard deviations."""
 _SOUND = 3
 _BORDER_SHARE = 0.05
 """Standard deviation of projection at the picture's border, over the width, above which a lens is a guess."""
@@ -508,7 +506,8 @@ def _decentred(fit: Calibration) -> bool:
     if fit.camera.fisheye or "p1" in fit.free_names:
         return False
     found = checks.left_out(fit, "p1", "p2")
-    return found.chi2 > _DECENTRED_CHI2 and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px)
+    by_chance = np.exp(-0.5 * found.chi2)
+    return bool(by_chance < _CHANCE and found.moved_px > _SKEW_PX * scale_of(fit.camera.image_size_px))
 
 
 def _skewed(fit: Calibration) -> bool:
