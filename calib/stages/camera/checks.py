@@ -490,6 +490,24 @@ _TOLD = 1e-3
 """What a view tells of a direction, over what all views do, below which it is silent there."""
 
 
+def components(
+    S: FloatArray, score: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """What views tell of independent directions, their squared scores there, and where they tell any, (N, G).
+
+    Where a view is silent they are one and zero.
+
+    Parameters
+    ----------
+    S, score : (N, G, G) and (N, G) of the views.
+    root : (G, G) or (N, G, G), L^-T of the information L L' that S is held against.
+    """
+    told, Q = np.linalg.eigh(np.swapaxes(root, -1, -2) @ S @ root)
+    counts = told > _TOLD
+    y2 = np.einsum("ngk,ng->nk", root @ Q, score) ** 2
+    return np.where(counts, told, 1.0), np.where(counts, y2, 0.0), counts
+
+
 def alone_px(calibration: bundle.Calibration) -> tuple[float, float]:
     """Standard deviations of a coordinate: if every view had a camera of its own, with a skew, and as it is.
 
@@ -497,11 +515,8 @@ def alone_px(calibration: bundle.Calibration) -> tuple[float, float]:
     each view's parameters, in the directions of which it tells anything.
     """
     found = evidence(_freed(calibration, "skew_px"))
-    root = _root(found)
-    told, Q = np.linalg.eigh(root.T @ found.S @ root)
-    y2 = np.einsum("ngk,ng->nk", root @ Q, found.b) ** 2
-    counts = told > _TOLD
-    fall = np.divide(y2, told, out=np.zeros_like(y2), where=counts).sum(axis=1)
+    told, y2, counts = components(found.S, found.b, _root(found))
+    fall = (y2 / told).sum(axis=1)
     others = np.arange(len(fall)) != np.argmax(fall)
     measured, cost = int((found.measured - 6)[others].sum()), found.cost[others]
 

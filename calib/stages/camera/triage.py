@@ -67,8 +67,6 @@ _FEW_POINTS = 0.1
 """Most of a view's points, as a share, that may be to blame for it."""
 _POINTS_SHARE = 0.3
 """A view that loses more of its points than this leaves whole."""
-_TOLD = 1e-3
-"""What a view tells of a direction, over what the others do, below which it is silent there."""
 _MEDIAN_CHI2 = 0.87
 """Median of chi-squared over its degrees of freedom, for four to eight of them."""
 
@@ -150,19 +148,16 @@ def _disagreement(found: checks.Evidence, core: BoolArray) -> _Disagreement:
     score = b + np.einsum("ngh,nh->ng", S, d)
     values, vectors = np.linalg.eigh(A)
     root = vectors / np.sqrt(np.maximum(values, 1e-15 * values[:, -1:]))[:, None]
-    told, Q = np.linalg.eigh(root.transpose(0, 2, 1) @ S @ root)
-    y2 = np.einsum("ngk,ng->nk", root @ Q, score) ** 2
-    counts = told > _TOLD
-    told = np.where(counts, told, 1.0)
+    told, y2, counts = checks.components(S, score, root)
     freedom = counts.sum(axis=1)
     there = found.cost + 2 * (b * d).sum(axis=1) + np.einsum("ng,ngh,nh->n", d, S, d)
-    own = there - np.where(counts, y2 / told, 0.0).sum(axis=1)
+    own = there - (y2 / told).sum(axis=1)
     variance = np.maximum(own, 0.0) / np.maximum(found.measured - 6 - freedom, 1)
     typical = max(float(np.median(variance[core])), 1e-12)
-    white = np.where(counts, y2 / (told * (1 + told)), 0.0).sum(axis=1) / np.maximum(freedom, 1) / typical
+    white = (y2 / (told * (1 + told))).sum(axis=1) / np.maximum(freedom, 1) / typical
     phi2 = max(float(np.median(white[core])) / _MEDIAN_CHI2, 1.0)
     r2 = np.clip(variance / typical, 1.0, _ODD_NOISE**2)[:, None]
-    T = np.where(counts, y2 / (told * (r2 + told)), 0.0).sum(axis=1) / (typical * phi2)
+    T = (y2 / (told * (r2 + told))).sum(axis=1) / (typical * phi2)
     return _Disagreement(S_core, d, score, freedom, T / np.maximum(freedom, 1), variance, typical, phi2)
 
 
