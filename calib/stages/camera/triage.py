@@ -65,8 +65,6 @@ _NEAR_FLOOR_PX = 0.06
 1000 pixels' width."""
 _FEW_POINTS = 0.1
 """Most of a view's points, as a share, that may be to blame for it."""
-_POINTS_SHARE = 0.3
-"""A view that loses more of its points than this leaves whole."""
 _MEDIAN_CHI2 = 0.87
 """Median of chi-squared over its degrees of freedom, for four to eight of them."""
 
@@ -256,8 +254,6 @@ _TURN_ALSO = 2.0
 """The same for a view beside one that is."""
 _TURN_EXCESS = 0.25
 """Disagreement of a turned view with the others over that of the view as it is, at most."""
-_TURN_PX = 0.3
-"""Change of directions by the turn below which it does not matter; pixels at up to 1000 pixels' width."""
 _TURN_WORSE = 1.05
 """Cost of a reading with views turned over that without the one view whose leaving lowers it most, from which
 on that view is odd and none was turned: .27 to .99 where views are turned, 1.26 beside another camera's."""
@@ -309,8 +305,6 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
         return []
     _, how, which, difference = best
     moved_px = checks.apart_px(calibration, difference)
-    if moved_px < _TURN_PX * scale_of(calibration.camera.image_size_px):
-        return []
     why = (
         f"agrees with the camera of the {N - int(which.sum())} others if it was {how} after it was taken, "
         f"and not as it is, where directions are off by {moved_px:.2g} px"
@@ -451,11 +445,8 @@ def _settled(calibration: Calibration, robust: bool) -> Triage:
         there = np.isfinite(distance)
         typical = float(np.median(distance[there & kept[:, None]]))
         new_far = far_points(distance, there, typical, floor_px)
-        share = new_far.sum(axis=1) / everything.present.sum(axis=1)
         nowhere = "no pose of the board explains it with the other views' camera"
         why = {int(i): nowhere for i in np.flatnonzero(~seen)}
-        for i in np.flatnonzero(share > _POINTS_SHARE):
-            why[int(i)] = f"{share[i]:.0%} of its points lie far from where the others put them"
         if views - len(why) >= _LEAST_VIEWS:
             usable = np.flatnonzero([i not in why for i in range(views)])
             part = replace(
