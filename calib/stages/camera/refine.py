@@ -776,7 +776,6 @@ _FAR = 0.2
 """Share of a square that no corner may be away from its prediction."""
 _UNKNOWN_SIGMA = 0.25
 """Sigma of a corner that was not refined, in squares."""
-_RESCUE_WINDOWS = (0.45, 0.28, 0.2)
 _SIGMAS, _UNSURE = 6.0, 8.0
 """Distance from its prediction in standard deviations of a corner, these up to so many times the median."""
 _PASSES = 3
@@ -1021,20 +1020,19 @@ def _checked(part: Part, fit: LocalFit, good: BoolArray) -> _Check | None:
 def _rescued(part: Part, fit: LocalFit) -> tuple[LocalFit, BoolArray, Prediction] | None:
     """Fit again, from where the others place them, the corners that failed or disagree with the others."""
     good = _trusted(part, fit)
-    for window in _RESCUE_WINDOWS:
-        check = _checked(part, fit, good)
-        if check is None:
-            return None
-        doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
-        if len(doubtful) == 0:
-            return fit, good, check.prediction
-        frames = frames_of(check.grid, fit.tones(part.shape)).take(doubtful)
-        again = fit_corners(part, check.placed[doubtful], frames, window=window)
-        trial = _merged(fit, again, doubtful)
-        near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
-        use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
-        fit = _merged(fit, again, doubtful, use)
-        good[doubtful[use]] = True
+    check = _checked(part, fit, good)
+    if check is None:
+        return None
+    doubtful = np.flatnonzero(~good | ~(check.away < check.bound))
+    if len(doubtful) == 0:
+        return fit, good, check.prediction
+    frames = frames_of(check.grid, fit.tones(part.shape)).take(doubtful)
+    again = fit_corners(part, check.placed[doubtful], frames, window=_CLOSE_WINDOW)
+    trial = _merged(fit, again, doubtful)
+    near = np.linalg.norm(again.points - check.placed[doubtful], axis=1)
+    use = _trusted(part, trial)[doubtful] & (~good[doubtful] | (near < 0.7 * check.away[doubtful]))
+    fit = _merged(fit, again, doubtful, use)
+    good[doubtful[use]] = True
     check = _checked(part, fit, good)
     if check is None:
         return None
