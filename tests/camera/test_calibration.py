@@ -438,7 +438,7 @@ SIMULATED = {
 
 
 def _chosen(found: Intrinsics) -> Candidate:
-    return next(one for one in found.models if one.lens == LensModel.of(found.calibration))
+    return next(one for one in found.models if one.name == str(LensModel.of(found.calibration)))
 
 
 @pytest.mark.slow
@@ -484,7 +484,7 @@ def test_a_skew_is_chosen_where_the_views_show_one(skew_px: float, roll_deg: flo
     found = calibrate_camera(views, (640, 480))
     assert LensModel.of(found.calibration) == LensModel("radial2", skew_px != 0.0)
     assert found.calibration.camera.skew_px == pytest.approx(skew_px, abs=0.3)
-    assert [one.name for one in found.models if one.lens.skew] == (
+    assert [one.name for one in found.models if "skew" in one.name] == (
         [f"{name}, skew" for name in MODELS if name != FISHEYE] if skew_px else []
     )
     never = calibrate_camera(views, (640, 480), Choices(skew=False))

@@ -128,12 +128,6 @@ class Candidate:
     soundness: int = _SOUND
 
     @property
-    def lens(self) -> LensModel:
-        """The lens model of this name."""
-        model, _, skew = self.name.partition(", ")
-        return LensModel(model, bool(skew))
-
-    @property
     def flaw(self) -> str:
         """Why it is no candidate, "" where it is one."""
         if self.soundness == _SOUND:
@@ -403,8 +397,6 @@ _TRIAGES = 3
 """Times that a model is chosen; bad views can make the first choice wrong."""
 _FEW_ODD = 2
 """Most views that are no second camera."""
-_FAR_BETTER = 0.5
-"""Squared error of a typical view over that by the chosen model."""
 
 
 @dataclass(frozen=True)
@@ -712,27 +704,15 @@ def _sorted_out(
     """The views that agree, by the model that views held back choose among them."""
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
 
-    def by(lens: LensModel, start: Block | None = None) -> Triage:
-        fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=start)
-        return Triage.of_all(fit) if fit.termination == "behind the camera" else _screened(fit)
-
     observations, before = everything, None
     for _ in range(_TRIAGES):
         lens, start, models = _chosen_model(observations, image_size_px, choices, excluded)
         if lens == before:
             break
         # The start has the poses of the views that the model was chosen by, which may be fewer.
-        found = by(lens, start.block if start is not None and observations is everything else None)
-        better = _better_for_most(str(lens), models)
-        if better is not None:
-            other = by(better.lens)
-            if better.soundness < _SOUND and len(other.left_out) > len(found.left_out):
-                # Behind the errors of a model that is too simple a bad view hides.
-                observations, before = other.calibration.observations, None
-                continue
-            # A model that is too simple blames views that the lens tells most of.
-            if better.soundness == _SOUND and len(other.left_out) < len(found.left_out):
-                found, lens = other, better.lens
+        first = start.block if start is not None and observations is everything else None
+        fit = calibrate(everything, image_size_px, lens.model, skew=lens.skew, fixed=fixed, start=first)
+        found = Triage.of_all(fit) if fit.termination == "behind the camera" else _screened(fit)
         if not found.left_out or choices.model != "auto":
             break
         observations, before = found.calibration.observations, lens
@@ -741,14 +721,6 @@ def _sorted_out(
         # A few more steps, or other views, took the lens where it may not go.
         return _sorted_out(everything, image_size_px, choices, (*excluded, str(lens)))
     return found, models
-
-
-def _better_for_most(lens: str, models: Sequence[Candidate]) -> Candidate | None:
-    """The model that is far better than the chosen one for a typical view that was held back."""
-    medians = {one.name: float(np.median(one.per_view_px2)) for one in models}
-    best = min(models, key=lambda one: np.nan_to_num(medians[one.name], nan=np.inf), default=None)
-    far = best is not None and medians[best.name] < _FAR_BETTER * medians.get(lens, np.inf)
-    return best if far else None
 
 
 def _judged(fit: Calibration, findings: Sequence[Finding]) -> Verdict:
