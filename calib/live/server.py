@@ -254,7 +254,7 @@ class Live:
     def _calibrate(self, number: int) -> None:
         if number < self._wanted:
             return
-        fit, self._saved = None, ""
+        fit, rig, self._saved = None, self.rig, ""
         if self.album.names():
             fit = self._fitted(self.album)
             if isinstance(fit, Failure):
@@ -262,7 +262,11 @@ class Live:
                 fit, self._saved = None, f"not saved: {words}"
             else:
                 self._saved = str(self.album.rig)
-        rig = Rig.load(self.album.rig, missing_ok=True)
+        try:
+            rig = Rig.load(self.album.rig, missing_ok=True)
+        except BadInputError as error:
+            # An editor may have it open at this moment.
+            self._saved = f"not saved: {error}"
         with self._lock:
             self.session.fitted(fit)
             self.rig = rig

@@ -674,6 +674,12 @@ def test_the_plane_is_what_extrinsics_makes_of_the_corner_that_was_clicked(
     with served(rig) as live, tab(live) as line:
         line.send('{"do": "camera", "size": [316, 208]}')
         wait(lambda: live.rig.camera is not None and not live.state()["fitting"])
+        # A file that an editor has half-written ends no session.
+        whole = (rig / "rig.yaml").read_bytes()
+        for do, text, says in (("drop", b"camera: [", "not saved: "), ("back", whole, str(rig))):
+            (rig / "rig.yaml").write_bytes(text)
+            line.send(json.dumps({"do": do, "name": "view01.png"}))
+            wait(lambda: live.state()["saved"].startswith(says) and not live.state()["fitting"])  # noqa: B023
         line.send('{"do": "place", "x_mm": 0, "y_mm": 0, "angle_deg": 0}')
         assert "First take a picture" in heard(line, "fault")["says"]
 
