@@ -93,6 +93,11 @@ def end_of(error: BaseException) -> tuple[int, str]:
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return EXIT_BAD_INPUT, f"{where}{error.strerror or error}"
+    if isinstance(error, ModuleNotFoundError) and not (error.name or "calib").startswith("calib"):
+        return (
+            EXIT_BAD_INPUT,
+            f"the Python package {error.name} is not there; install {DISTRIBUTION} with pip again",
+        )
     where, trace = "", error.__traceback__
     while trace is not None:
         module = str(trace.tb_frame.f_globals.get("__name__", ""))

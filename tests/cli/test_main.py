@@ -104,6 +104,8 @@ def test_a_mistake_of_the_program_is_one_sentence(calib, monkeypatch, tmp_path) 
     [
         (MemoryError(), 3, "out of memory"),
         (KeyboardInterrupt(), 130, "interrupted; files that were there before"),
+        (ModuleNotFoundError("No module", name="yaml"), 3, "the Python package yaml is not there; install"),
+        (ModuleNotFoundError("No module", name="calib.x"), 70, "internal error: ModuleNotFoundError"),
         (OSError(5, "Input/output error", "/x/rig.yaml"), 3, "/x/rig.yaml: Input/output error"),
     ],
 )
