@@ -543,17 +543,13 @@ def _kept(out: Path, names: tuple[str, ...], pages: bool) -> dict[str, bytes]:
     return files
 
 
-def peak_memory_MB() -> float:
-    """Largest resident memory of this process in megabytes, since it was last forgotten."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
+def peak_memory_MB() -> float | None:
+    """Largest resident memory of this process in megabytes since it was last forgotten; Linux alone tells."""
+    with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return round(1.024e-3 * int(line.split()[1]), 1)
-    with contextlib.suppress(ImportError):
-        import resource
-
-        return round(1.024e-3 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 1)
-    return float("nan")
+    return None
 
 
 # ----------------------------------------------------------------------

@@ -32,10 +32,11 @@ from calib.core.words import short
 from calib.core.workers import Processes, Task
 from calib.runner import outcomes
 from calib.runner.cache import program
+from calib.stages.control.references import BUILT_IN, built_in
 from calib.stages.control.tracking import Tracking
-from calib.stages.control.trial import control_model, run_controller
+from calib.stages.control.trial import CONTROLLERS, control_model, run_controller
 from calib.twin.rig import SimulatedRig, rig_from_file
-from calib.twin.scenarios import SCENARIOS
+from calib.twin.scenarios import SCENARIOS, make_scenario, run_scenario
 
 # ----------------------------------------------------------------------
 # The specification of a sweep: what is run, over which parameters, and what is measured.
@@ -262,9 +263,6 @@ def read_sweep(path: Path) -> Sweep:
 
 def _problems(spec: Sweep) -> Iterator[str]:
     """What does not fit together, in sentences."""
-    from calib.stages.control.references import BUILT_IN
-    from calib.stages.control.trial import CONTROLLERS
-
     base = spec.base
     wanted: dict[str, tuple[str, tuple[str, ...]]] = {"scenario": (base.scenario, tuple(SCENARIOS))}
     if base.kind == "controller":
@@ -362,8 +360,6 @@ def run_case(base: Base, case: Case, seed: int) -> dict[str, float | None]:
     plant = rig_from_file(Rig.of(_document(base.rig, changed), _HERE))
     if base.kind == "controller":
         return _controlled(base, known, plant, noise)
-    from calib.twin.scenarios import make_scenario, run_scenario
-
     plan = make_scenario(base.scenario, options)
     run = run_scenario(plan, plant, noise, base.feedback, base.duration_s)
     if base.kind == "scenario":
@@ -394,8 +390,6 @@ def _document(text: str, changed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _controlled(base: Base, known: Rig, plant: SimulatedRig, seed: int) -> dict[str, float | None]:
-    from calib.stages.control.references import built_in
-
     model = control_model(rig_from_file(known), known.controller)
     reference = built_in(model, base.other, base.duration_s)
     outcome = run_controller(base.name, plant, model, reference, known.controller, seed, base.feedback)
