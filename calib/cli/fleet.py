@@ -265,18 +265,8 @@ def _tell_sweep(summary: SweepSummary) -> None:
     for title, points in (("best", summary.best[:5]), ("worst", summary.worst[:5])):
         if not points:
             continue
-        names = list(points[0].parameters)
-        head = [title, *names, f"{summary.measure}, median", "worst draw", *summary.measures[1:_MEASURES]]
-        rows = [
-            [
-                f"#{point.point}",
-                *(_text(value) for value in point.parameters.values()),
-                *map(_text, (point.median, point.worst)),
-                *(_text(point.measures[name]) for name in summary.measures[1:_MEASURES]),
-            ]
-            for point in points
-        ]
-        say_table(head, rows)
+        head = summary.heads(title)[: len(points[0].parameters) + 2 + _MEASURES]
+        say_table(head, [[f"#{one.point}", *map(_text, one.cells)][: len(head)] for one in points])
 
 
 def _text(value: Any) -> str:

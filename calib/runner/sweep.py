@@ -286,6 +286,9 @@ def _problems(spec: Sweep) -> Iterator[str]:
     twice = next((key for key in spec.grid if key in spec.draws.parameters), None)
     if twice is not None:
         yield f"{twice} is in grid and in draws, expected it in one of them"
+    again = next((name for k, name in enumerate(spec.measure) if name in spec.measure[:k]), None)
+    if again is not None:
+        yield f"measure names {quoted(again)} twice"
     if spec.near is not None and not spec.measure:
         yield "near says what the first measure should be, and measure names none"
     if not spec.names and spec.cases == 1:
@@ -448,6 +451,11 @@ class Point:
     draws: int
     measures: dict[str, float]
 
+    @property
+    def cells(self) -> list[Any]:
+        """A row of a table: parameters, the measure that decides as median and worst, the other measures."""
+        return [*self.parameters.values(), self.median, self.worst, *list(self.measures.values())[1:]]
+
 
 @dataclass(frozen=True)
 class SweepSummary:
@@ -471,6 +479,11 @@ class SweepSummary:
     best: tuple[Point, ...]
     worst: tuple[Point, ...]
     clouds: tuple[tuple[str, tuple[tuple[float, float], ...]], ...]
+
+    def heads(self, first: str, label: Callable[[str], str] = str) -> list[str]:
+        """The heading of `Point.cells` behind a `first` column, names under their labels."""
+        names, (decides, *others) = map(label, self.best[0].parameters), map(label, self.measures)
+        return [first, *names, f"{decides}, median", "worst draw", *others]
 
 
 def run_sweep(

@@ -226,7 +226,7 @@ def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
     base = spec.base
     what = f"{base.kind} {base.name}" + (f" on {base.other}" if base.other else "")
     tables = [
-        (title, _heads(summary, points), [_sweep_page_row(point) for point in points])
+        (title, summary.heads("point", _headed), [_sweep_page_row(point) for point in points])
         for title, points in (("Best points", summary.best), ("Worst points", summary.worst))
         if points
     ]
@@ -249,16 +249,9 @@ def sweep_page_text(spec: Sweep, summary: SweepSummary) -> str:
     )
 
 
-def _heads(summary: SweepSummary, points: tuple[Point, ...]) -> list[str]:
-    others = [name for name in summary.measures if name != summary.measure]
-    parameters, rest = map(_headed, points[0].parameters), map(_headed, others)
-    return ["point", *parameters, f"{_headed(summary.measure)}, median", "worst draw", *rest]
-
-
 def _sweep_page_row(point: Point) -> list[tuple[str, Any]]:
-    cells = [*point.parameters.values(), point.median, point.worst, *list(point.measures.values())[1:]]
     out: list[tuple[str, Any]] = [(f"#{point.point}", point.point)]
-    for cell in cells:
+    for cell in point.cells:
         if isinstance(cell, float):
             out.append((f"{cell:.4g}", cell) if cell == cell else ("", None))
         else:

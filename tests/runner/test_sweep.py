@@ -72,6 +72,7 @@ def test_grid_times_draws(tmp_path: Path) -> None:
         ("base: {scenario: swing, reference: jump}\n", "reference is that of a controller"),
         (_BASE + "grid: {pump.lag_s: [1]}\ndraws: {pump.lag_s: {normal: [1, 1]}}\n", "in grid and in draws"),
         (_BASE + "grid: {pump.lag_s: [1]}\nnear: 2\n", "measure names none"),
+        (_BASE + "grid: {pump.lag_s: [1]}\nmeasure: [rise_s, rise_s]\n", "measure names 'rise_s' twice"),
     ],
 )
 def test_what_is_no_sweep(tmp_path: Path, text: str, said: str) -> None:
