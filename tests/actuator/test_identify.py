@@ -26,6 +26,7 @@ from calib.stages.actuator.identify import (
     Start,
     Track,
     _coarse,
+    _left,
     _spread,
     _whole,
     colour_of,
@@ -641,6 +642,19 @@ def test_a_play_is_found_where_there_is_one(play: dict[str, float], tmp_path: Pa
         assert abs(found.values[name] - width) < 3.5 * sigma[name] < 0.2 * width
     for name in {*truth} & {*found.values}:
         assert abs(found.values[name] - truth[name]) < 3.5 * sigma[name], name
+
+
+def test_rows_that_both_models_miss_say_nothing_of_either() -> None:
+    problem = Problem(Machine(), [track("prbs")], ("stiffness_scale", "lag_s"), {})
+    x, cost, residual, J = solve(problem, first_guess(problem, values_of(Machine())))
+    found = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    worse, strays = 1.5 * residual, np.zeros_like(residual)
+    strays[10:110:2] = 500.0
+    seen = replace(found, residual=residual + strays)
+    assert _left(problem, worse, found) > 1.5
+    assert _left(problem, worse + strays, seen) == pytest.approx(_left(problem, worse, found), rel=0.05)
+    # What the other model meets is counted.
+    assert _left(problem, residual, seen) < 0.1
 
 
 @pytest.mark.few(1)
