@@ -456,8 +456,7 @@ class Piece:
 
     Attributes
     ----------
-    phi, length : (n,), NaN where two pixels have no solution. fine : (n,) pictures that go with their
-        neighbours.
+    phi, length : (n,), NaN where two pixels have no solution. fine : (n,) pictures that have one.
     theta : (m,) integrated rate.
     """
 
@@ -500,25 +499,6 @@ def _cuts(log: AlignLog) -> list[float]:
     gaps = np.flatnonzero(steps > max(SPLIT_S, _SPLIT_STEPS * float(np.median(steps))))
     first = float(felt[0]) + _SETTLED_S
     return [first, *(0.5 * (felt[i] + felt[i + 1]) for i in gaps.tolist() if felt[i] > first), math.inf]
-
-
-def _fives(values: FloatArray) -> FloatArray:
-    """Each of the values (n,) between the two before and the two after it, (n, 5), mirrored at the ends."""
-    padded = np.concatenate([values[2:0:-1], values, values[-2:-4:-1]])
-    return np.lib.stride_tricks.sliding_window_view(padded, 5)
-
-
-def _like_neighbours(phi: FloatArray, turned: FloatArray) -> BoolArray:
-    """Pictures whose angle is near the median of five, but for what the gyroscope has turned (n,) meanwhile.
-
-    Of a swing of which there are three pictures in a period all are far from that median.
-    """
-    if len(phi) < 5:
-        return np.isfinite(phi)
-    filled = np.where(np.isfinite(phi), phi, np.nanmedian(phi) if np.isfinite(phi).any() else 0.0)
-    off, swung = (one - np.median(_fives(one), axis=1) for one in (filled, turned))
-    limit = max(6.0 * robust_sigma(off), 0.04) + np.abs(_fives(swung)).max(axis=1)
-    return np.asarray(np.isfinite(phi) & (np.abs(off) <= limit))
 
 
 _SPIKE = 20.0
@@ -567,8 +547,7 @@ def pieces_of(
             pixels, readings = log.pixels[seen], log.readings[felt]
             phi, length = heads_seen(view, sensor, pixels, _LENGTH_M).T.copy()
             theta = _integrated(imu.t_s, readings[:, 2])
-            fine = _like_neighbours(phi, np.interp(camera.t_s, imu.t_s, theta))
-            pieces.append(Piece(number, camera, imu, pixels, readings, phi, length, fine, theta))
+            pieces.append(Piece(number, camera, imu, pixels, readings, phi, length, np.isfinite(phi), theta))
             kept += 1
         split = f"split at {len(cuts) - 2} gap(s) of the gyroscope" if len(cuts) > 2 else ""
         if kept == 0:
@@ -580,7 +559,7 @@ def pieces_of(
 
 
 def _use(piece: Piece, offset_s: float) -> BoolArray:
-    """Pictures that go with their neighbours and were exposed while the IMU ran."""
+    """Pictures of a head that were exposed while the IMU ran."""
     exposed = piece.camera.t_s - offset_s
     inside = (exposed >= piece.imu.t_s[0]) & (exposed <= piece.imu.t_s[-1])
     return np.asarray(inside & piece.fine)
