@@ -459,7 +459,6 @@ def _chosen_model(
     observations: Observations,
     image_size_px: tuple[int, int],
     choices: Choices,
-    excluded: tuple[str, ...] = (),
 ) -> tuple[LensModel, Calibration | None, tuple[Candidate, ...]]:
     """The lens model, a fit of it to start from, and the comparison that chose it."""
     asked = bool(choices.skew)
@@ -470,7 +469,7 @@ def _chosen_model(
 
     def compared(skew: bool) -> tuple[list[Candidate], list[Calibration], int]:
         found = candidates_by_model(observations, image_size_px, skew=skew, loss=choices.loss)
-        candidates = [replace(one, soundness=0) if one.name in excluded else one for one, _ in found]
+        candidates = [one for one, _ in found]
         return candidates, [fit for _, fit in found], chosen_lens(candidates, scale_of(image_size_px))
 
     candidates, fits, best = compared(asked)
@@ -556,7 +555,7 @@ def calibrate_camera(
     leaving = [*left_out, *unusable, *odd]
     agree = sorted_out.calibration.observations.views
     moved_px = _moved_px(replace(sorted_out, everything=of_all))
-    findings, shared = list(of_leaving(leaving, agree, choices.keep_all, moved_px)), list[Finding]()
+    findings = list(of_leaving(leaving, agree, choices.keep_all, moved_px))
     if sorted_out.left_out and not _alone_odd(sorted_out):
         several = two_cameras(sorted_out.everything)
         if any(one.severity == "inconsistent" for one in findings):
@@ -568,8 +567,7 @@ def calibrate_camera(
             fit = calibrate(shaped, image_size_px, lens.model, skew=lens.skew, start=first)
             sorted_out = Triage.of_all(fit)
             leaving = [*left_out, *unusable, *turned]
-            findings = list(of_leaving(leaving, everything.views, choices.keep_all))
-            shared = several
+            findings = [*of_leaving(leaving, everything.views, choices.keep_all), *several]
     not_used = [*left_out, *unusable] if choices.keep_all else leaving
     fit = sorted_out.calibration
     if choices.keep_all:
@@ -587,8 +585,6 @@ def calibrate_camera(
     findings += of_copies(copies)
     of_shape = [] if board.name == "rigid" else of_board(board.flat)
     verdict = _judged(fit, [*findings, *of_shape])
-    if shared and verdict.word in ("ok", "poor"):
-        verdict = _judged(fit, [*findings, *of_shape, *shared])
     if verdict.word == "unidentifiable":
         # Views that do not tell the camera do not tell the board's shape either.
         better = checks.best_of_starts(board.flat if choices.board == "auto" else fit)
@@ -699,14 +695,13 @@ def _sorted_out(
     everything: Observations,
     image_size_px: tuple[int, int],
     choices: Choices,
-    excluded: tuple[str, ...] = (),
 ) -> tuple[Triage, tuple[Candidate, ...]]:
     """The views that agree, by the model that views held back choose among them."""
     fixed = ("cx_px", "cy_px") if everything.views == 1 else ()
 
     observations, before = everything, None
     for _ in range(_TRIAGES):
-        lens, start, models = _chosen_model(observations, image_size_px, choices, excluded)
+        lens, start, models = _chosen_model(observations, image_size_px, choices)
         if lens == before:
             break
         # The start has the poses of the views that the model was chosen by, which may be fewer.
@@ -716,10 +711,6 @@ def _sorted_out(
         if not found.left_out or choices.model != "auto":
             break
         observations, before = found.calibration.observations, lens
-    promised = next((one.soundness for one in models if one.name == str(lens)), 0)
-    if promised == _SOUND > _soundness(found.calibration):
-        # A few more steps, or other views, took the lens where it may not go.
-        return _sorted_out(everything, image_size_px, choices, (*excluded, str(lens)))
     return found, models
 
 
