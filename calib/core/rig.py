@@ -200,16 +200,15 @@ class Rig(InWords):
         """The rig of a file's contents; `source` is its name for sentences. Raises as `load`."""
         schema = _schema_of(document, source)
         unknown = [name for name in document if name not in KINDS and name != "schema"]
-        if len(unknown) == len([name for name in document if name != "schema"]) and "schema" not in document:
+        hint = nearest(str(unknown[0]), KINDS) if unknown else ""
+        if not hint and "schema" not in document and len(unknown) == len(document):
             has = ", ".join(quoted(name) for name in unknown[:3]) or "nothing"
             raise BadInputError(
                 f"{shown(source)}: is not a rig.yaml: it has {has}, expected sections as camera or provenance"
             )
         if unknown:
-            name = str(unknown[0])
-            raise BadInputError(
-                f"{shown(source)}: {one_line(name)} is not a section that is known here{nearest(name, KINDS)}"
-            )
+            name = one_line(str(unknown[0]))
+            raise BadInputError(f"{shown(source)}: {name} is not a section that is known here{hint}")
         sections = {name: document[name] for name in KINDS if document.get(name) is not None}
         # The arm is one kind of actuator, and has a section of its own beside another.
         bends = isinstance(sections.get("actuator"), dict) and sections["actuator"].get("kind") == ARM_KIND

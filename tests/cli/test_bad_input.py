@@ -256,6 +256,7 @@ def test_a_wrong_board_file(calib, pictures, tmp_path, text: str) -> None:
 
 RIGS = {
     b"services:\n  web: {image: nginx}\n": "is not a rig.yaml: it has 'services', expected sections",
+    b"geometri: {}\n": "geometri is not a section that is known here; did you mean geometry?",
     b"": "holds nothing",
     bytes(range(256)): "is not UTF-8 text",
     b"a: &a [*a]\n": "expands to more than",
