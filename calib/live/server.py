@@ -254,7 +254,7 @@ class Live:
     def _calibrate(self, number: int) -> None:
         if number < self._wanted:
             return
-        fit, rig, self._saved = None, self.rig, ""
+        fit, self._saved = None, ""
         if self.album.names():
             fit = self._fitted(self.album)
             if isinstance(fit, Failure):
@@ -266,7 +266,7 @@ class Live:
             rig = Rig.load(self.album.rig, missing_ok=True)
         except BadInputError as error:
             # An editor may have it open at this moment.
-            self._saved = f"not saved: {error}"
+            rig, self._saved = self.rig, f"not saved: {error}"
         with self._lock:
             self.session.fitted(fit)
             self.rig = rig
