@@ -604,6 +604,7 @@ _BETTER = 0.9
 1.9 to 2.2 where it is not, and 1.1 to 1.4 where pumps have a play, which neither knows."""
 _SOFT = 2.0
 _FAR_OFF = 30.0
+"""Deviations of a reading that show another thing than the marker, where no model comes nearer."""
 _REFINED = 3
 _ROUNDS = 4
 _MOVES = 4.0

@@ -815,7 +815,7 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 # ----------------------------------------------------------------------
 # Batch least squares for what the sensors are, over splines for how the head moved.
 #
-# The normal equations are those of `align_problem`. Camera, accelerometer and gyroscope read the same motion
+# The normal equations are those of `_normal`. Camera, accelerometer and gyroscope read the same motion
 # with errors of known size, so that the fit, which makes the motion and the sensors' quantities most likely
 # together, is a total least squares: right on the average while the motion is left free (Van Huffel and
 # Vandewalle 1991).
@@ -1007,7 +1007,7 @@ def _followed(stretch: Stretch, c: FloatArray, fit: Fit) -> Stretch:
 # Camera and IMU of a moving rig brought into line: time offset, mount angle, scales, biases, marker.
 #
 # Under constant curvature two pixels tell the angle and the length, so that what camera and IMU say of the
-# same motion can be compared: `align_start` finds where to begin, `align_solve` fits the sensors'
+# same motion can be compared: `start` finds where to begin, `solve` fits the sensors'
 # quantities and a spline of the motion to all readings at once (continuous-time batch estimation: Furgale,
 # Barfoot and Sibley 2012). Priors come from outside; where the posterior is no narrower, the logs say
 # nothing.

@@ -135,9 +135,9 @@ def _largest_factor(
     omega: FloatArray,
     most: float,
 ) -> float:
-    """Largest factor on a controller's loops.response (k,) that keeps the margins at rigs; 0 if none.
+    """Largest factor on a controller's response (k,) that keeps the margins at rigs; 0 if none.
 
-    `rigs` are responses (k, n, n), each with its loops.loci (k, n).
+    `rigs` are responses (k, n, n), each with its loci (k, n).
     """
 
     def good(factor: float) -> bool:

@@ -438,7 +438,7 @@ _OF_CAMERA, _FEWEST = 0.4, 100
 """Pictures are whole pixels with a jitter of their own: on 108 good logs of nine plants, wrong ones among
 them, the correlation stayed within .22; where a column was not what it said it was .56 to 1."""
 _AWAY = 3.2
-"""Deviations: one of eight quantities is off by as much in one of a hundred logs at most."""
+"""Deviations: one of seven quantities is off by as much in one of a hundred logs at most."""
 _PLACES = {"camera": "pictures", "pose": "poses"}
 """Names of what sees the place, and words for its readings."""
 _CALIBRATED = {
