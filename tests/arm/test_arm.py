@@ -546,7 +546,12 @@ def test_units_that_no_arm_has_are_told() -> None:
             said = [str(error)]
         assert any(words in text for text in said)
     assert "as psi would" not in _findings(columns, trial)
-    assert "as psi would" in _findings(columns | {"p1_kpa": columns["p1_kpa"] / 6.895}, trial)
+    for name, factor, words in (
+        ("p1_kpa", 0.145, "as psi would"),
+        ("p1_kpa", 0.01, "its pressure is 2.51 kPa at most, as bar would"),
+        ("p_cmd1_kpa", 0.01, "its command is 2.7 kPa at most, as bar would"),
+    ):
+        assert words in _findings(columns | {name: factor * columns[name]}, trial)
 
 
 def test_pressures_from_vacuum_are_told() -> None:

@@ -255,7 +255,7 @@ def _check_sizes(recording: Recording) -> None:
             f"{source}: base and tip are {float(np.nanmedian(chord)):.4g} m apart, expected at most "
             f"{_LONGEST_M:g}; columns.yaml takes millimetres, each column with factor: 0.001"
         )
-    most = _greatest_kpa(recording)
+    most = max(_greatest_kpa(recording).values(), default=0.0)
     if most > _MOST_KPA:
         raise BadInputError(
             f"{source}: pressures reach {most:.4g} kPa, expected at most {_MOST_KPA:g}; columns.yaml takes "
@@ -263,11 +263,11 @@ def _check_sizes(recording: Recording) -> None:
         )
 
 
-def _greatest_kpa(recording: Recording) -> float:
-    """Greatest command or pressure, whatever its sign; NaN without any, and of a pump under PWM."""
-    both = () if recording.pwm else (recording.command, recording.pressure)
-    read = [one for one in both if one is not None and np.isfinite(one).any()]
-    return max((float(np.nanmax(np.abs(one))) for one in read), default=math.nan)
+def _greatest_kpa(recording: Recording) -> dict[str, float]:
+    """Greatest command and pressure by these words, whatever the sign; none of a pump under PWM."""
+    both = {} if recording.pwm else {"command": recording.command, "pressure": recording.pressure}
+    read = {what: one for what, one in both.items() if one is not None and np.isfinite(one).any()}
+    return {what: float(np.nanmax(np.abs(one))) for what, one in read.items()}
 
 
 def _odd_pressures(recording: Recording) -> Iterator[Finding]:
@@ -292,13 +292,13 @@ def _odd_pressures(recording: Recording) -> Iterator[Finding]:
                 "columns.yaml takes psi with factor: 6.895",
             )
             return
-    most = _greatest_kpa(recording)
-    if 0.0 < most < _LEAST_KPA:
-        yield Finding(
-            "poor",
-            f"{name}: pressures reach {most:.3g} kPa at most, as bar would",
-            "look for their unit; columns.yaml takes bar with factor: 100",
-        )
+    for what, most in _greatest_kpa(recording).items():
+        if 0.0 < most < _LEAST_KPA:
+            yield Finding(
+                "poor",
+                f"{name}: its {what} is {most:.3g} kPa at most, as bar would",
+                "look for its unit; columns.yaml takes bar with factor: 100",
+            )
 
 
 def _frozen_signals(recording: Recording) -> Iterator[Finding]:
