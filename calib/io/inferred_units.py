@@ -200,7 +200,7 @@ def _infer_accel_unit(first: _FirstReadings) -> _FirstReadings:
     likely = [u for u, ratio in in_g.items() if least <= ratio <= most and u != "counts"]
     found = f"the specific force is {force:.4g} where the log is calm"
     if unit in likely or (not unit and len(likely) == 1):
-        return first.with_unit(names, likely[0], found)
+        return first.with_unit(names, unit or likely[0], found)
     advice = first.advice("acc", "accel", "|".join(likely))
     if not unit and likely:
         # Two per cent lie between mg and cm/s^2, and more in how level a rig stands.

@@ -252,6 +252,16 @@ def test_what_the_readings_contradict_is_refused_with_what_to_do(
         read_log(path, LogOptions(**options))  # type: ignore[arg-type]
 
 
+def test_axes_without_a_unit_have_that_of_the_others(tmp_path: Path) -> None:
+    """Which is not mg, though the readings would allow it."""
+    t, values = _imu()
+    names = ["t", "ax", "ay", "az", "gx", "gy", "gz"]
+    path = _written(tmp_path / "log.csv", names, [t, *(values * np.repeat([100.0, 1.0], 3)).T])
+    (tmp_path / "columns.yaml").write_text("ax_mps2: {column: ax, unit: cm/s2}\n")
+    log = read_log(path)
+    assert all(np.allclose(log.columns[name], values[:, k], atol=1e-4) for k, name in enumerate(AXES))
+
+
 def test_stamps_in_whole_seconds_tell_no_time(tmp_path: Path) -> None:
     t, values = _imu()
     path = _written(tmp_path / "log.csv", NAMED.split(), [t // 1.0, *values.T])
