@@ -231,7 +231,7 @@ def _column(word: str, unit: str) -> tuple[str, str] | None:
     kind = kind_of(column)
     if not column or (unit and unit not in UNITS[kind]):
         return None
-    return column, own_unit(column) if kind in ("pixel", "pwm") else unit
+    return column, unit or (own_unit(column) if kind in ("pixel", "pwm") else "")
 
 
 @dataclass(frozen=True)

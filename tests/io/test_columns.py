@@ -79,6 +79,7 @@ def _written(
         ("velocità angolare z", ("gz_radps", "")),
         ("Magnetometer X (uT)", None),
         ("x [px]", ("u_px", "px")),
+        ("duty1 (%)", ("pwm1", "percent")),
         ("millis [s]", None),
         ("gyro_x_mdeg/s", ("gx_radps", "mdeg/s")),
         ("temperature", None),
