@@ -229,7 +229,7 @@ def test_the_head_is_let_go_when_it_is_held_still_and_not_before(bare: Built, tm
 
 
 @pytest.mark.parametrize(("slow", "again"), [(1, 0), (20, 90)])
-def test_a_head_that_is_slow_for_a_sample_is_wait_for_release(slow: int, again: int) -> None:
+def test_a_head_that_is_slow_for_a_sample_is_let_go(slow: int, again: int) -> None:
     """One sample at the release is between still and gone; 0.2 s of them are a hand that slips."""
     now_s, words = 0.0, []
 
