@@ -39,6 +39,7 @@ _FASTEST_RADPS = 45.0
 _LARGEST_BIAS_RADPS = 0.35
 _LOUDEST_RADPS, _QUIETEST_RADPS = 0.02, 1.5e-4
 """Spread of a gyroscope at rest: no sensor is louder, and none of those on cheap boards is quieter."""
+_ROUNDING_RADPS = 1e-12
 _ROUGH = 0.1
 """Share of a spread that its fourth differences show: 1 of white noise, 0.27 of noise that is low-passed at
 2 Hz of 100, 0.04 at most of a swing with eight readings a period."""
@@ -310,7 +311,7 @@ def _infer_gyro_unit(first: _FirstReadings) -> _FirstReadings:
     if unit:
         if not wrong[unit]:
             return first
-        other = "rad/s" if unit == "deg/s" else "deg/s"
+        other = next(iter(likely), "rad/s" if unit == "deg/s" else "deg/s")
         raise first.refused(
             f"the gyroscope {wrong[unit]}, which none does in {unit}; if it is in {other}, "
             f"{first.advice('gyro', 'gyro', other)}"
@@ -464,6 +465,7 @@ def _implausible_at_rest(calm: FloatArray, spread: FloatArray, swing: float, qui
     rough = np.median(np.diff(calm, 4, axis=1).std(axis=1), axis=0) / math.sqrt(70.0)
     if ((spread > _LOUDEST_RADPS) & (rough > _ROUGH * spread)).any():
         return f"is never quieter than {float(spread.max()):.3g} rad/s"
-    if 0.0 < float(spread.max()) < quietest:
+    # One that is stuck says nothing: what it leaves is rounding.
+    if _ROUNDING_RADPS < float(spread.max()) < quietest:
         return f"is as quiet as {float(spread.max()):.2g} rad/s"
     return ""

@@ -221,6 +221,7 @@ def test_a_file_without_a_header(tmp_path: Path) -> None:
         # A person who does.
         (NAMED, (1, 1, 1), {"acc_unit": "g"}, "is in m/s2, not in g; give --acc-unit m/s2"),
         (NAMED, (1, 1, 1), {"gyro_unit": "deg/s"}, "none does in deg/s; if it is in rad/s"),
+        (NAMED, (1, 1, 1), {"gyro_unit": "mdeg/s"}, "none does in mdeg/s; if it is in rad/s"),
         # One of two that are alike.
         ("t ax ay az gx gy gz", (1, 100, 1), {}, "981.* in mg or in cm/s2; give --acc-unit mg|cm/s2 or add"),
         (
@@ -360,9 +361,10 @@ def test_a_marker_that_turns_with_the_gyroscope_tells_its_unit(
     assert log.map is not None and "px away from the axis" in log.map.narration
 
 
-def test_a_gyroscope_at_rest_that_may_be_either_is_not_guessed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stuck", [False, True])
+def test_a_gyroscope_at_rest_that_may_be_either_is_not_guessed(tmp_path: Path, stuck: bool) -> None:
     t, values = _imu(moving=False)
-    columns = [t, *values[:, :3].T, 4.0 * values[:, 5]]
+    columns = [t, *values[:, :3].T, np.full(len(t), 0.00844367) if stuck else 4.0 * values[:, 5]]
     path = _written(tmp_path / "log.csv", ["t", "ax", "ay", "az", "gz"], columns)
     words = "cannot tell whether `gz` is in rad/s or in deg/s, as either is possible"
     with pytest.raises(BadInputError, match=words):
