@@ -15,13 +15,14 @@ from calib.core.verdict import Finding, Verdict
 from calib.io.logs import Log
 from calib.io.sensor_faults import Watch
 from calib.stages.estimator.consistency import SENSORS, Tally
-from calib.stages.estimator.driven import Drive, Handover
+from calib.stages.estimator.driven import PARAMETER, SIGMA, Drive, Handover
 from calib.stages.estimator.kinematic import OUT
 from calib.stages.estimator.read import READINGS
 from calib.stages.estimator.replay import (
     captured,
     consistent,
     contradicting,
+    grown,
     jumped,
     sampled,
     untimely,
@@ -159,6 +160,23 @@ def test_an_angle_that_gravity_contradicts_is_told(scenario: str) -> None:
         estimate.run(rows_from(moved))
         told = [one.text for one in contradicting(setup, estimate.sensor, float(np.ptp(log.t_s)))]
         assert bool(told) == (aside_px > 0.0), told
+
+
+@pytest.mark.parametrize("scenario", ["static", "ellipse"])
+def test_a_camera_that_moved_along_the_actuator_is_told(scenario: str) -> None:
+    """Pictures two pixels along it: q1 and q2 are 2 mm off, ten deviations, and nothing else tells."""
+    _, log = driven_log(scenario)
+    setup = setup_for(varied_drive(0))
+    sigma = np.array(SIGMA)
+    sigma[PARAMETER.index("rest_length_m")] = 3.5e-4
+    drive = Drive(sigma=tuple(sigma), covariance=np.diag(sigma**2))
+    for along_px in (0.0, -2.0, 2.0):
+        moved = replace(log, columns={**log.columns, "v_px": log.columns["v_px"] + along_px})
+        estimate = Handover(setup, drive)
+        estimate.run(rows_from(moved))
+        longer_m, sigma_m = estimate.longer_m
+        assert bool(list(grown(longer_m, sigma_m))) == (along_px != 0.0), longer_m
+        assert along_px * longer_m >= 0.0
 
 
 @pytest.mark.parametrize("size", [3, 12])

@@ -1327,6 +1327,14 @@ class DrivenFilter:
         here = int(self._memory.whole[NEWEST])
         return self._memory.x[here].copy(), self._memory.P[here].copy()
 
+    @property
+    def longer_m(self) -> tuple[float, float] | None:
+        """By how much the actuator is longer than identified, and that value's deviation; None without."""
+        at, before = DYNAMIC + PARAMETER.index("rest_length_m"), self._model
+        if self.drive.covariance is None:
+            return None
+        return float(self.state[0][at] - before.x0[at]), math.sqrt(before.P0[at, at])
+
 
 assert SIZE == 20
 
@@ -1700,6 +1708,11 @@ class Handover:
         one, other = self._kinematic.sensor - self._before, self._driven.state[0][INVOLVED:] - self._before
         nearer = np.copysign(np.minimum(np.abs(one), np.abs(other)), one)
         return np.asarray(self._before + np.where(one * other > 0.0, nearer, 0.0))
+
+    @property
+    def longer_m(self) -> tuple[float, float] | None:
+        """As `DrivenFilter.longer_m`."""
+        return self._driven.longer_m
 
     def run(self, rows: Rows) -> FloatArray:
         """Estimates (n, len(OUT)) at the rows' stamps; call again with the rows that follow."""

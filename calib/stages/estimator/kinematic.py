@@ -1084,6 +1084,9 @@ def starting_state(setup: Setup, rows: Rows | None = None) -> tuple[FloatArray, 
 class Filter:
     """A filter at work: rows in, estimates out, with memory of the last events only."""
 
+    longer_m = None
+    """As of `driven.DrivenFilter`, whose plant alone has a length at rest."""
+
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         levels, walk = setup.process.arrays()

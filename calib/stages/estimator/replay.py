@@ -290,12 +290,13 @@ def smoothed_rows(log: OpenLog, until_s: float) -> FloatArray:
 @dataclass(frozen=True)
 class Smoothed:
     """Rows of `OUT` of a whole log by the filter and by the smoother, the truth (n, 3), and what the filter
-    has come to say of the sensors (14,)."""
+    has come to say of the sensors (14,) and of the rest length."""
 
     filtered: FloatArray
     out: FloatArray
     truth: FloatArray
     sensor: FloatArray
+    longer_m: tuple[float, float] | None
 
 
 def _whole(setup: Setup, found: Periods, stream: Iterable[Log]) -> tuple[Rows, FloatArray]:
@@ -324,11 +325,11 @@ def smooth_log(setup: Setup, found: Periods, stream: Iterable[Log], drive: Drive
     if drive is None:
         fused = Filter(setup)
         filtered = fused.run(rows)
-        return Smoothed(filtered, smooth(setup, rows, filtered), truth, fused.sensor)
+        return Smoothed(filtered, smooth(setup, rows, filtered), truth, fused.sensor, None)
     both = Handover(setup, drive)
     driven, kinematic, weight = both.run_each(rows)
     out = smooth_both(setup, drive, rows, driven, kinematic)
-    return Smoothed(blended(driven, kinematic, weight), out, truth, both.sensor)
+    return Smoothed(blended(driven, kinematic, weight), out, truth, both.sensor, both.longer_m)
 
 
 def _watched(stream: Iterator[Log], watch: Watch, most: int, option: str) -> Iterator[Log]:
@@ -582,6 +583,29 @@ def jumped(tally: Tally) -> Iterator[Finding]:
         )
 
 
+_LONGER_M = 5e-4
+"""Other rest length that is told. Logs of sound rigs, one of an orifice and one without creep, have .2 mm at
+most; pictures two pixels along the actuator .8 to 2, with q1 and q2 as far off."""
+
+
+def grown(longer_m: float, sigma_m: float) -> Iterator[Finding]:
+    """A finding where the actuator is longer, or shorter, than commands and its identification say.
+
+    Parameters
+    ----------
+    longer_m, sigma_m : of `DrivenFilter.longer_m`.
+    """
+    if abs(longer_m) > max(_LONGER_M, _AWAY * sigma_m):
+        yield Finding(
+            "poor",
+            f"the actuator rests {1e3 * abs(longer_m):.1f} mm {'longer' if longer_m > 0 else 'shorter'} than "
+            f"identified, {abs(longer_m) / sigma_m:.1f} times its sigma: the camera has moved along it, or "
+            "it has changed",
+            "find the plane again (calib extrinsics); if that is as it was, measure the rest length again, "
+            "where known states it, and run calib identify again",
+        )
+
+
 _NO_ARC_RAD = math.radians(3.0)
 """A tip that is 1 mm beside its place turns the arc of 65 mm by 1.8 degrees."""
 
@@ -782,6 +806,7 @@ def replay_log(
     kept: list[FloatArray] = []
     compared: dict[str, Errors] = {}
     sensor: FloatArray | None = None
+    longer_m: tuple[float, float] | None = None
     findings = _unstated(rig) if has_commands(log.first) or rig.standing["actuator"] else []
     with _states_to(output, columns, kept.append if keep else None) as write:
         if estimator == "filterpy":
@@ -794,7 +819,7 @@ def replay_log(
             stream = _watched(log.stream, sums.watch, _SMOOTHED_ROWS, "--smooth")
             whole = smooth_log(log.setup, log.periods, stream, drive)
             sums.add(whole.out, whole.truth)
-            sensor = whole.sensor
+            sensor, longer_m = whole.sensor, whole.longer_m
             filtered = Tally(radius_m)
             filtered.add(whole.filtered, whole.truth)
             if filtered.scored:
@@ -805,7 +830,7 @@ def replay_log(
             baseline = Baseline(baseline_setup(log.setup, rig, rig_path, log.periods)) if pictures else None
             estimate = estimator_for(log.setup, drive, model)
             _stream(log, estimate.run, baseline, fused, sums, write, progress)
-            sensor = estimate.sensor
+            sensor, longer_m = estimate.sensor, estimate.longer_m
             if fused and sums.baseline.scored:
                 compared["baseline"] = _lengths_and_angle(sums.baseline)
             elif not fused and sums.fused.scored:
@@ -813,6 +838,9 @@ def replay_log(
     states = np.concatenate(kept) if kept else None
     trace = sums.trace.values if sums.trace is not None else np.zeros((0, 0))
     name = estimator if not smoothed else "smoothed"
+    # An actuator that its logs do not bear out is a model that errs, which moves the rest length as well.
+    if fused and longer_m is not None and rig.actuator is not None and rig.actuator.verdict.ok:
+        findings += grown(*longer_m)
     result = _replayed(log, name, sums, compared, sensor, findings)
     result.doubt(rig.doubts(_taken(log, drive is not None)))
     return result.with_evidence(Held(trace, columns, states))
