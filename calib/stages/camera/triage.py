@@ -254,6 +254,8 @@ _TURN_ALSO = 2.0
 """The same for a view beside one that is."""
 _TURN_EXCESS = 0.25
 """Disagreement of a turned view with the others over that of the view as it is, at most."""
+_TURN_PX = 0.3
+"""Change of directions by the turn below which it does not matter; pixels at up to 1000 pixels' width."""
 _TURN_WORSE = 1.05
 """Cost of a reading with views turned over that without the one view whose leaving lowers it most, from which
 on that view is odd and none was turned: .27 to .99 where views are turned, 1.26 beside another camera's."""
@@ -305,6 +307,8 @@ def turned_views(calibration: Calibration) -> list[LeftOut]:
         return []
     _, how, which, difference = best
     moved_px = checks.apart_px(calibration, difference)
+    if moved_px < _TURN_PX * scale_of(calibration.camera.image_size_px):
+        return []
     why = (
         f"agrees with the camera of the {N - int(which.sum())} others if it was {how} after it was taken, "
         f"and not as it is, where directions are off by {moved_px:.2g} px"
