@@ -567,7 +567,7 @@ def run_fleet(
 ) -> Counter[str]:
     """Run all rigs whose results are not there, each in `limit_s` seconds at most. Raises as `run_all`."""
     named = {spec.name for spec in manifest.rigs}
-    if others := {path.name for path in (store.out / "rigs").glob("*")} - named:
+    if others := {path.name for path in (store.out / "rigs").glob("*") if path.is_dir()} - named:
         left = several(sorted(map(one_line, others)))
         tell(f"rigs/: holds results of an earlier run of what the manifest does not name: {left}")
     tasks = (

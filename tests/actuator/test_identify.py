@@ -655,6 +655,10 @@ def test_rows_that_both_models_miss_say_nothing_of_either() -> None:
     assert _left(problem, worse + strays, seen) == pytest.approx(_left(problem, worse, found), rel=0.05)
     # What the other model meets is counted.
     assert _left(problem, residual, seen) < 0.1
+    # Where both miss most rows, the one that misses them by less is the better.
+    off = np.zeros_like(residual)
+    off[: problem.spans[-1].stop] = 100.0
+    assert _left(problem, 0.5 * off, replace(found, residual=off)) == pytest.approx(0.5, rel=0.05)
 
 
 @pytest.mark.few(1)

@@ -604,7 +604,8 @@ _BETTER = 0.9
 1.9 to 2.2 where it is not, and 1.1 to 1.4 where pumps have a play, which neither knows."""
 _SOFT = 2.0
 _FAR_OFF = 30.0
-"""Deviations of a reading that show another thing than the marker, where no model comes nearer."""
+"""Deviations, or times what a typical reading is off, from which on one shows another thing than the marker,
+where no model comes nearer."""
 _REFINED = 3
 _ROUNDS = 4
 _MOVES = 4.0
@@ -950,7 +951,9 @@ def _left(problem: Problem, residual: FloatArray, solution: Solution) -> float:
     Rows that show another thing in place of the marker cost the same in both, and hide what the others tell.
     """
     rows = problem.spans[-1].stop
-    told = np.minimum(np.abs(residual[:rows]), np.abs(solution.residual[:rows])) < _FAR_OFF
+    least = np.minimum(np.abs(residual[:rows]), np.abs(solution.residual[:rows]))
+    # Where most rows are far off it is the models that err.
+    told = least <= _FAR_OFF * max(float(np.median(least)), 1.0)
     one, other = (
         float(robust_cost(of, np.concatenate([r[:rows][told], r[rows:]])))
         for of, r in ((problem, residual), (solution.problem, solution.residual))
