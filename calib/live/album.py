@@ -13,8 +13,18 @@ import yaml
 from calib.core.errors import BadInputError
 from calib.core.files import shown
 from calib.core.options import options_of
+from calib.core.rig import SECTIONS
 from calib.core.stage import Files
-from calib.core.writing import RIG_FILE, Kind, begins, make_folder, move, write_atomically
+from calib.core.writing import (
+    RIG_FILE,
+    Kind,
+    begins,
+    check_folder,
+    check_writable,
+    make_folder,
+    move,
+    write_atomically,
+)
 from calib.io.pictures import holds_pictures, list_pictures
 from calib.stages import stage
 from calib.stages.camera.model import View
@@ -67,9 +77,12 @@ class Album:
     def open(self, told: Told) -> tuple[BoardFile, tuple[View, ...], tuple[int, int] | None]:
         """The board as far as it is known, the views of an earlier session, and the size of its pictures.
 
-        Raises `BadInputError` where the folder cannot be made or read, or tells another board than `told`.
+        Raises `BadInputError` where the folder cannot be made, read or written, or tells another board than
+        `told`.
         """
+        check_folder(self.images)
         make_folder(self.images)
+        check_writable(self.rig, SECTIONS)
         board = read_board_file(self.images)
         stated = None if board.corners is None else (board.corners[0], board.corners[1])
         for flag, here, there in (

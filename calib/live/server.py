@@ -522,7 +522,7 @@ class Live:
             elif not back and self.album.drop(name):
                 with self._lock:
                     self.session.drop(name)
-            else:
+            elif self.album.picture(name) is None:
                 raise BadInputError(f"{shown(name)}: is not there")
         except CalibError as error:
             await self.tell_all({"type": "fault", "says": str(error)})

@@ -622,6 +622,10 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
         wait(lambda: live.album.left_out() == ["view001.png"])
         line.send('{"do": "back", "name": "view001.png"}')
         wait(lambda: live.album.names() == ["view001.png"])
+        # Asked for twice, as on two pages, it is done once.
+        line.send('{"do": "back", "name": "view001.png"}')
+        line.send('{"do": "nonsense"}')
+        assert "does not know" in heard(line, "fault")["says"]
         second.send('{"do": "camera"}')
         heard(line, "lent")
         with tab(live) as third:
@@ -868,6 +872,10 @@ def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
             browser.own = (*browser.own, live.address)
             browser.open(live.address, 1200, 1000)
             wait(lambda: "Press c" in browser.run("document.getElementById('says').textContent"))
+            browser.run("state.source = 'here'")
+            browser.key("c", 67, "c")
+            assert browser.run("new Promise(done => setTimeout(done, 50)).then(() => stream === null)")
+            browser.run("state.source = 'browser'")
             browser.key("c", 67, "c")
             wait(lambda: live.state()["verdict"] == "ok" and not live.state()["fitting"])
             told = (
@@ -884,9 +892,14 @@ def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
                 assert "no colour" in told[2]
                 if told[1] > answered + 10:
                     break
+            browser.key("3", 51, "3")
+            wait(lambda: browser.run("state.step") == "marker")
+            assert browser.run("stays < performance.now()")
             browser.run("video.pause()")
             wait(lambda: "no new pictures" in browser.run("document.getElementById('says').textContent"))
             browser.run("video.play()")
+            browser.key("1", 49, "1")
+            wait(lambda: browser.run("state.step") == "camera")
             assert len(live.state()["pictures"]) >= 4
             first = (live.album.images / "view001.png").read_bytes()
             assert isinstance(live._take(first, by_hand=False), Seen)
@@ -968,6 +981,11 @@ def test_what_the_command_refuses(
     code, said = ends("x.mp4")
     assert code == 3 and "x.mp4: cannot be opened" in said
     assert ends("--square", "20")[0] == 2
+    rig = tmp_path / "ro" / "rig.yaml"
+    rig.parent.mkdir()
+    rig.write_text("geometry: {}\n")
+    rig.chmod(0o444)
+    assert ends("-o", "ro") == (3, "calib: ro/rig.yaml: cannot be written: it is read-only\n")
     monkeypatch.setattr(Live, "serve", lambda *_: None)
     code, said = ends()
     assert code == 3 and "no picture was taken" in said
