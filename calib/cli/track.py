@@ -104,6 +104,10 @@ def track(
                 if limit_s is not None and times.stamps_s[-1] - times.stamps_s[0] > limit_s:
                     times.stamps_s.pop()
                     break
+                if size_px not in (None, frame.shape[1::-1]):
+                    narrate(f"from here on frames have {frame.shape[1]}x{frame.shape[0]} px: the log ends")
+                    times.stamps_s.pop()
+                    break
                 if tracker is None:
                     size_px = frame.shape[1], frame.shape[0]
                     if disc is not None:

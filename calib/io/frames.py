@@ -12,10 +12,17 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from calib.core.arrays import GrayImage
+from calib.core.arrays import AnyArray, GrayImage
 from calib.core.errors import BadInputError, UsageError
 from calib.core.files import VIDEOS, check_readable, hash_of, is_bag, one_line, shown
-from calib.io.pictures import Picture, decoded_picture, eight_bits, split_fields
+from calib.io.pictures import (
+    Picture,
+    declared_pixels,
+    decode,
+    decoded_picture,
+    eight_bits,
+    split_fields,
+)
 
 if TYPE_CHECKING:
     from calib.io.bag_topics import Topic
@@ -229,7 +236,26 @@ def opened_video(source: int | str) -> cv2.VideoCapture | None:
     video = cv2.VideoCapture()
     video.open(source)
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    if "://" in str(source) and int(video.get(cv2.CAP_PROP_FOURCC)) == _MJPEG:
+        # As it comes: OpenCV would scale all frames to the first one's size, also once that is switched.
+        video.set(cv2.CAP_PROP_FORMAT, -1)
     return video if video.isOpened() else None
+
+
+_MJPEG = cv2.VideoWriter.fourcc(*"MJPG")
+
+
+def next_frame(video: cv2.VideoCapture) -> AnyArray | None:
+    """The next whole frame (H, W, 3) of a video that `opened_video` opened; None at the end."""
+    while True:
+        there, frame = video.read()
+        if not there or frame is None:
+            return None
+        if video.get(cv2.CAP_PROP_FORMAT) != -1:
+            return frame
+        data = frame.tobytes()
+        if 0 < declared_pixels(data) <= _MOST_PIXELS and (whole := decode(data, colour=True)) is not None:
+            return whole
 
 
 def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[Any, Any]]]:
@@ -250,8 +276,8 @@ def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[A
         black = True
         try:
             while True:
-                there, frame = video.read()
-                if not there or frame is None:
+                frame = next_frame(video)
+                if frame is None:
                     break
                 if frame.shape[0] * frame.shape[1] > _MOST_PIXELS:
                     raise BadInputError(f"{name}: frames have over {_MOST_PIXELS // 10**6} million pixels")

@@ -62,6 +62,9 @@ class Marker:
         """What a page is told of a frame (H, W, 3) that was taken at a time; a row where that is recorded."""
         if frame.ndim == 2:
             return {"code": "dark", "says": "The picture has no colours: a marker cannot be told in it."}
+        if self.recording and self._frame is not None and frame.shape != self._frame.shape:
+            self.stop()
+            self.last += "; it ended where frames of another size came"
         self._frame = frame
         if self.tracker is None:
             self.tracker = Tracker(self.colour)

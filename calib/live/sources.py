@@ -15,7 +15,7 @@ import cv2
 from calib.core.arrays import AnyArray
 from calib.core.errors import BadInputError
 from calib.core.files import read_bytes, shown
-from calib.io.frames import opened_video
+from calib.io.frames import next_frame, opened_video
 from calib.io.pictures import declared_pixels, decode, decoded_heic, holds_pictures, is_heic, list_pictures
 
 os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")
@@ -74,8 +74,8 @@ class Capture:
                 time.sleep(_AGAIN_S)
                 video = None if self._over else opened_video(self._where)
                 continue
-            there, frame = video.read()
-            if not there or frame is None or frame.shape[0] * frame.shape[1] > MOST_PIXELS:
+            frame = next_frame(video)
+            if frame is None or frame.shape[0] * frame.shape[1] > MOST_PIXELS:
                 video.release()
                 if self._file:
                     self.fault = f"{self._name} has ended."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import http.server
 import json
 import os
 import re
@@ -474,6 +475,42 @@ def test_a_video_of_a_phone_held_upright_has_the_sensors_own_rows(tmp_path: Path
     assert frame is not None and frame.shape == (48, 64, 3)
 
 
+def test_a_stream_whose_size_is_switched_has_frames_of_both_sizes(tmp_path: Path) -> None:
+    """As by the page of an ESP32-CAM; a damaged frame is left out."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None:
+            pass
+
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace;boundary=frame")
+            self.end_headers()
+            whole = [jpeg(np.full((h, 4 * h // 3), 90, np.uint8)) for h in (48, 96)]
+            with contextlib.suppress(OSError):
+                for data in (*30 * whole[:1], whole[0][:300], *300 * whole[1:]):
+                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                    self.wfile.write(head.encode() + data + b"\r\n")
+                    time.sleep(0.005)
+
+    camera = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=camera.serve_forever, daemon=True).start()
+    source = source_of(f"http://127.0.0.1:{camera.server_port}/stream", tmp_path / "images")
+    assert source is not None
+    sizes = set[tuple[int, ...]]()
+
+    def both() -> bool:
+        frame = source.read()
+        sizes.add(frame.shape if frame is not None else ())
+        return sizes - {()} == {(48, 64, 3), (96, 128, 3)}
+
+    wait(both)
+    assert source.fault == ""
+    source.close()
+    camera.shutdown()
+    camera.server_close()
+
+
 # ----------------------------------------------------------------------
 # The server.
 
@@ -781,6 +818,14 @@ def test_a_marker_is_recorded_while_one_looks_at_it(tmp_path: Path, monkeypatch:
             heard(line, "seen")
         assert not live.marker.recording and "2 of 2 frames" in live.marker.last
         assert len(read_log(log.with_name("track2.csv")).t_s) == 2
+        # Frames of another size are of another camera.
+        line.send('{"do": "record"}')
+        for shown, at_s in ((frame, 0.3), (frame, 0.4), (cv2.resize(frame, (320, 240)), 0.5)):
+            line.send(json.dumps({"do": "at", "t_s": at_s}))
+            line.send(jpeg(shown))
+            heard(line, "seen")
+        assert not live.marker.recording and "ended where frames of another size came" in live.marker.last
+        (tmp_path / "rig" / "logs" / "track3.csv").unlink()
         # One that sees nothing leaves nothing.
         line.send('{"do": "record"}')
         line.send('{"do": "stop"}')
