@@ -66,7 +66,8 @@ def track(
     """Make a log of a coloured disc from a video or a camera: its centre below a pixel, and how sure that is.
 
     A frame in which the marker is not seen, or not told apart from another disc, has no row. Exits 1 when
-    fewer than 90 of 100 frames have one, and when the rig's camera was calibrated at another size.
+    fewer than 90 of 100 frames have one, when the rig's camera was calibrated at another size, and when
+    times that had to be counted contradict the file's.
     """
     from calib.core.rig import Rig
     from calib.io.frames import timed_frames
@@ -161,7 +162,7 @@ def track(
     other_size = calibrated_px not in (None, size_px)
     if other_size:
         narrate(_other_size(source, size_px, rig, calibrated_px))
-    if other_size or seen < _GATE * len(found):
+    if other_size or times.astray_s() or seen < _GATE * len(found):
         raise typer.Exit(EXIT_POOR)
 
 

@@ -194,6 +194,24 @@ class Times:
             raise BadInputError("the video has no times that increase, and tells no rate of frames")
         return [k / self.rate_hz for k in range(len(self.stamps_s))]
 
+    def astray_s(self) -> float:
+        """By how much counted times leave stamps that increase between two places where they do not.
+
+        Less than that of frames that are decoded in another order, or of a rate that is told as 30 for 29.97,
+        is 0.
+        """
+        if self.usable or self.rate_hz <= 0:
+            return 0.0
+        stamps = np.array(self.stamps_s)
+        k = np.arange(len(stamps))
+        begins = np.flatnonzero(np.r_[True, np.diff(stamps) <= 0])
+        begin = begins[np.searchsorted(begins, k, side="right") - 1]
+        counted = (k - begin) / self.rate_hz
+        off = np.abs(stamps - stamps[begin] - counted)
+        return float(
+            np.where(off > np.maximum(_REORDERED / self.rate_hz, _TOLD_RATE * counted), off, 0.0).max()
+        )
+
     def words(self) -> str:
         """One sentence."""
         steps = np.diff(self.settled_s()) * 1e3
@@ -201,7 +219,14 @@ class Times:
             return "one frame, so no times"
         usual, low, high = float(np.median(steps)), float(steps.min()), float(steps.max())
         if not self.usable:
-            return f"the stamps do not increase: times are counted at the {self.rate_hz:g} Hz of the file"
+            counted = f"the stamps do not increase: times are counted at the {self.rate_hz:g} Hz of the file"
+            if not self.astray_s():
+                return counted
+            back = next(k for k, step in enumerate(np.diff(self.stamps_s)) if step <= 0) + 1
+            return (
+                f"{counted}, and are up to {self.astray_s():.2f} s off its stamps: cut the video at frame "
+                f"{back}, where they go back"
+            )
         span = f"a frame each {usual:.2f} ms ({low:.2f} to {high:.2f})"
         if self.arrival:
             return f"times of arrival at this computer, {span}; later than the exposure by an unknown time"
@@ -210,6 +235,8 @@ class Times:
         return f"times from the file, {span}"
 
 
+_REORDERED, _TOLD_RATE = 2.5, 0.01
+"""Frames that decoding may put between two stamps, and by what share a file's rate may be off."""
 _LEAST_STEP_MS, _ROUNDING_MS = 4.0, 0.6
 """A step that a millisecond more or less leaves one step, and what rounding leaves about a fitted line."""
 
@@ -268,7 +295,9 @@ def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[A
         check_readable(source)
     video = opened_video(str(source) if isinstance(source, Path) else source)
     if video is None:
-        what = "video that can be read" if isinstance(source, Path) else "camera that can be opened"
+        what = "camera that can be opened"
+        if isinstance(source, Path):
+            what = "video that can be read; one whose end is missing, or that holds sound alone, is none"
         raise BadInputError(f"{name}: is not a {what}")
     times = Times(not isinstance(source, Path), float(video.get(cv2.CAP_PROP_FPS)))
 

@@ -352,6 +352,11 @@ def test_the_centre_of_the_ellipse_is_not_that_of_the_disc() -> None:
 def test_what_times_are_worth() -> None:
     assert Times(False, 30.0, [0.0, 0.0, 0.1]).settled_s() == [0.0, 1 / 30, 2 / 30]
     assert "counted at the 30 Hz" in Times(False, 30.0, [0.0, 0.0, 0.1]).words()
+    # A video that is put together of two, of even and of variable rate.
+    even, variable = ([*part, *part] for part in (list(np.arange(90) / 29.97), [0.0, 0.1, 0.2, 0.233, 0.4]))
+    assert Times(False, 30.0, even).astray_s() == 0.0
+    assert Times(False, 30.0, variable).astray_s() == pytest.approx(0.4 - 4 / 30)
+    assert "cut the video at frame 5" in Times(False, 30.0, variable).words()
     assert "(20.00 to 50.00)" in Times(False, 30.0, [0.0, 0.02, 0.07]).words()
     assert "later than the exposure" in Times(True, 30.0, [5.0, 5.02, 5.04]).words()
 
