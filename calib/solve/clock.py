@@ -62,6 +62,9 @@ _LATER = 0.15
 up to a period after their last sample was taken."""
 _AT_ONCE = 0.05
 """Share of bursts that are taken to be read at once, or sooner for jitter."""
+_WHEN_FULL = 0.2
+"""Robust deviation, in periods, of how late bursts are that are read when a buffer is full; of those that are
+read at any time within a period it is 0.37."""
 _WINDOW = 11
 _LOOKS = 7
 """Looks, at most, at whether gaps are in their places."""
@@ -72,6 +75,8 @@ _WHOLE, _ALMOST, _OTHERS, _WITHIN = 0.02, 0.85, 12, 1.3
 are nearly a period; how many unlike the usual one are enough to tell; by how many stamps leave a line."""
 _CLOSE, _BURSTS = 0.25, 0.25
 """Steps below this share of the mean one are within a burst; where so many steps are, bursts are the rule."""
+_GAP = 2.5
+"""Steps, in usual ones, from which on samples are missing whatever the jitter."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +149,18 @@ class TimeAxis:
         whole = [one for one in (round(rate), 1e3 / max(round(1e3 / rate), 1)) if one > 0]
         best = min(whole, key=lambda one: abs(one - rate))
         return float(best) if abs(best / rate - 1.0) < _NOMINAL else rate
+
+    @property
+    def shift_sigma_s(self) -> float:
+        """Standard deviation [s] by which all times may be off together, from the jitter of the stamps."""
+        steps = np.diff(self.stamps_s, append=math.inf)
+        if self.steady:
+            # Of a burst the last stamp alone tells.
+            last = steps > _CLOSE * self.period_s
+            return robust_sigma((self.stamps_s - self.t_s)[last]) / math.sqrt(last.sum())
+        # The times are the stamps; steps, but for gaps, have twice their variance.
+        usual = steps[steps < _GAP * np.median(steps)]
+        return float(np.std(usual)) / math.sqrt(2.0 * len(usual)) if len(usual) else 0.0
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
@@ -304,8 +321,11 @@ def _fit_stretch(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | Non
     places = np.arange(len(t)) + np.repeat(k - anchors, count).astype(np.int64)
     times = origin + period * places + np.interp(places, k, wander)
     if by.bursts:
-        # The least late ones tell when their last samples were taken, and none was before the reading before.
-        times += np.quantile(t[anchors] - (origin + period * k) - wander, _AT_ONCE)
+        late = t[anchors] - (origin + period * k) - wander
+        # Read as a buffer is full they are late by no more than the stamps of single samples. Else the least
+        # late ones tell when their last samples were taken. None was before the reading before.
+        full = robust_sigma(late) < _WHEN_FULL * period
+        times += np.median(late) if full else np.quantile(late, _AT_ONCE)
         before = np.concatenate([[-math.inf], t[anchors[:-1]]])
         times = np.maximum(times, np.repeat(before, count))
     times = np.maximum.accumulate(times)

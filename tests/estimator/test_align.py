@@ -38,6 +38,7 @@ from calib.stages.align.solve import (
     _accelerations_at,
     _beside,
     _centred,
+    _followed,
     _from_axis,
     _likely,
     _own,
@@ -556,6 +557,9 @@ def test_exact_readings_give_the_truth_back() -> None:
     assert fit.sensor[7] == pytest.approx(TRUTH[7], abs=2e-6)
     assert fit.sensor[0] == pytest.approx(TRUTH[0], abs=2e-6)
     assert c.shape == fit.coefficients[0].shape
+    # A second fit goes on from there, whether or not a reading was missed: from the first guess the pictures
+    # of a fine camera all look like something else.
+    assert _followed(stretch, fit.coefficients[0], fit).start is fit.coefficients[0]
 
 
 @pytest.mark.slow

@@ -182,6 +182,7 @@ class Stretch:
     knots, start : of the spline, and its coefficients (count, 2) to begin with.
     loose : (spans, 2) deviation of the accelerations of phi and l.
     missed : (m, 3) by how much the spline misses readings where it cannot follow the motion, elsewhere 0.
+    clock_s : deviation of the time offset in this stretch by the jitter of both sensors' stamps.
     """
 
     log: int
@@ -193,6 +194,7 @@ class Stretch:
     start: FloatArray
     loose: FloatArray
     missed: FloatArray
+    clock_s: float = 0.0
 
     @cached_property
     def steep(self) -> FloatArray:
@@ -737,6 +739,7 @@ def _stretch(piece: Piece, offset_s: float) -> Stretch | None:
     return Stretch(
         piece.log, piece.camera.t_s[inside], piece.pixels[inside], piece.imu.t_s, piece.readings, knots,
         np.stack([phi, length], axis=1), _loose(knots, piece), np.zeros_like(piece.readings),
+        math.hypot(piece.camera.shift_sigma_s, piece.imu.shift_sigma_s),
     )  # fmt: skip
 
 
@@ -995,8 +998,6 @@ def _followed(stretch: Stretch, c: FloatArray, fit: Fit) -> Stretch:
         off[part] = np.minimum(off[part], np.abs(stretch.readings[part] - alone))
     off[~known] = 0.0
     off[off <= _UNFOLLOWED * fit.noise.of(stretch, slice(None))] = 0.0
-    if not off.any():
-        return stretch
     # Of samples that come in bursts most have the time of the one before.
     step_s = float(stretch.imu_s[-1] - stretch.imu_s[0]) / (len(stretch.imu_s) - 1)
     near = math.ceil(stretch.knots.span_s / step_s - 1e-6)
@@ -1322,12 +1323,13 @@ def _own(problem: Problem, fit: Fit, name: str, size: float, stretch: Stretch, c
 
 
 def _walked(settings: Settings, problem: Problem, fit: Fit) -> FloatArray:
-    """Covariance (14, 14) from biases that differ from stretch to stretch."""
+    """Covariance (14, 14) from biases and a time offset that differ from stretch to stretch."""
     total = np.zeros((len(SENSOR), len(SENSOR)))
     for i, stretch in enumerate(problem.stretches):
         root = math.sqrt(float(stretch.imu_s[-1] - stretch.imu_s[0]) / 3.0)
-        for at, walk in ((_AX, settings.accel_walk), (_AY, settings.accel_walk), (_GZ, settings.gyro_walk)):
-            moved = _beside(problem, fit, partial(_own, problem, fit, SENSOR[at], walk * root), [i])[3]
+        walks = (_AX, settings.accel_walk), (_AY, settings.accel_walk), (_GZ, settings.gyro_walk)
+        for at, size in (*((at, walk * root) for at, walk in walks), (_OFFSET, stretch.clock_s)):
+            moved = _beside(problem, fit, partial(_own, problem, fit, SENSOR[at], size), [i])[3]
             total += np.outer(moved, moved)
     return total
 

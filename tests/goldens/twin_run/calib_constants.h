@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x48585F4BUL
+#define CALIB_ID 0x7ADADBEEUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -167,7 +167,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), for D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.486947417f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.486948699f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -176,8 +176,8 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.080478169f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0316675752f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0804781988f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0316675715f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.00145137f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00599101325f /* gz at rest, rad/s; sign as read; for programs of your own */
 #define CALIB_IMU_MOUNT_ANGLE_RAD 0.0185449924f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
@@ -236,13 +236,13 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.51305258f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_DELAY_TICKS 1.51305127f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000257220352f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.77762069e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 2.0549327e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.77069671e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.77762023e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 2.05493361e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.77069625e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000257593696f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -8.54130394e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_2 -8.54130303e-06f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00252354005f /* K_a, share of the accelerometer's residual */
 #define CALIB_FUSED_ACCEL_WEAK 0.000257241598f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00827232841f /* dt / 2 over the gyroscope's scale, s */
@@ -251,7 +251,7 @@
 #define CALIB_FUSED_ALONE_PHI_PER_M 5.26462555f /* the same without the IMU, rad/m */
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.5292511f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00252451003f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.18783918f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_LENGTH 0.187839165f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00685631391f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.00903077237f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */

@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x80E38621UL
+#define CALIB_ID 0xD7617E34UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -165,7 +165,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), for D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.516244292f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.516246617f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -174,8 +174,8 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0142360982f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0697078705f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0142360963f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.069707863f /* subtracted from ay, m/s^2 */
 #define CALIB_IMU_ACCEL_RATIO 1.01687789f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
 #define CALIB_IMU_GYRO_BIAS_RADPS 0.00600092066f /* gz at rest, rad/s; sign as read; for programs of your own */
 #define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228712764f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
@@ -193,7 +193,7 @@
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
 #define CALIB_MM_DT_S 0.0163863227f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.83330101e-05f /* bias times the same, rad */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.83330174e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
@@ -234,22 +234,22 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.48375571f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_DELAY_TICKS 1.48375332f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000251634832f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 5.85336602e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -3.99032388e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.7562138e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -3.99032342e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.75621334e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000255881867f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.77550337e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_2 -1.77550319e-05f /* row 2, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_GAIN 0.00249288836f /* K_a, share of the accelerometer's residual */
 #define CALIB_FUSED_ACCEL_WEAK 0.00025411704f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
 #define CALIB_FUSED_HALF_DT_S 0.00819316134f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.91665051e-05f /* bias times the same, rad */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.91665087e-05f /* bias times the same, rad */
 #define CALIB_FUSED_PHI_PER_M 0.376666754f /* K_c / lever, rad/m */
 #define CALIB_FUSED_ALONE_PHI_PER_M 5.30418682f /* the same without the IMU, rad/m */
 #define CALIB_FUSED_BOOST_PHI_PER_M 10.6083736f /* the same after a start, rad/m */
 #define CALIB_FUSED_BIAS 0.00252561248f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.188889369f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_LENGTH 0.188889354f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00691431621f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.00911324657f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
