@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +15,7 @@ import typer
 
 from calib.cli.common import JsonOption, document, narrate, refuse_recorded, say
 from calib.core.errors import BadInputError, UsageError, pip_install
-from calib.core.files import shown
+from calib.core.files import shown, to_be
 from calib.core.units import parse_duration_s
 from calib.core.writing import appending, check_writable, make_folder, writes_through
 
@@ -41,9 +43,13 @@ class _Port:
             )
         self._errors = (serial.SerialException, OSError)
         try:
-            self.line = serial.Serial(name, baud, timeout=0.02, write_timeout=1.0)
+            # Two programs that read one port get half of what comes each.
+            self.line = serial.Serial(name, baud, timeout=0.02, write_timeout=1.0, exclusive=True)
         except (*self._errors, ValueError) as error:
-            raise BadInputError(f"{self.name}: cannot be opened: {_reason(error)}") from error
+            why = _reason(error)
+            if getattr(error, "errno", None) in (errno.EAGAIN, errno.EBUSY):
+                why = "another program has it open, as a serial monitor or another calib record; close that"
+            raise BadInputError(f"{self.name}: cannot be opened: {why}") from error
 
     def read(self) -> bytes:
         try:
@@ -144,7 +150,7 @@ def _experiments(
                     which = f"{PROGRAMME.index(name) + 1} of {len(PROGRAMME)}: " if do == _ALL else ""
                     narrate(f"{which}{name}, {plan.seconds:g} s; {plan.asks}")
                     _ready(yes)
-                    with appending(path, LOG) as stream:
+                    with to_be("written", path), appending(path, LOG) as stream:
                         done = perform(board, plan, level, _writer(stream), narrate)
                     results.append({"log": shown(path), **vars(done)})
                     if not as_json:
@@ -198,8 +204,8 @@ def _writer(stream: BinaryIO) -> Callable[[str], None]:
 
 
 def _complete(path: Path, seconds: float) -> bool:
-    """Whether a log is there. Raises `BadInputError` for one that was cut."""
-    if not path.is_file():
+    """Whether a log with samples is there. Raises `BadInputError` for one that was cut."""
+    if not path.is_file() or not path.stat().st_size:
         return False
     try:
         last = float(path.read_bytes().rstrip().rsplit(b"\n", 1)[-1].split(b",", 1)[0])
@@ -262,11 +268,13 @@ def _ticks(
         _writer(logs[number][1])(text)
 
     try:
-        with line.line:
+        with line.line, to_be("written", output):
             result = run(line.read, more, write)
     finally:
         for _, stream in logs:
-            stream.close()
+            # What the disk had no place for has been told.
+            with contextlib.suppress(OSError):
+                stream.close()
     if not result.runs:
         raise BadInputError(f"{line.name}: no frame came, expected the example sketch at {baud} baud")
     if result.opening:

@@ -112,6 +112,8 @@ _RESTARTS_S = 3.0
 _ANSWER_S = 12.0
 """A usual board restarts when its port is opened, and computes its self-test."""
 
+_BACKLOG_S = 0.3
+"""Longer than it takes to read all that a computer and its driver keep of a port that nobody reads."""
 _RUN_S = 5.0
 MOST_PWM = 250
 """Below the greatest command, which the board allows for a few seconds only."""
@@ -222,6 +224,7 @@ def perform(
     Raises `BadInputError` where the board restarts, falls silent, or does not let the pumps run.
     """
     board.port.write(serial.CLEAR)
+    _pass_over_backlog(board)
     _wait_for(board, lambda message: isinstance(message, serial.ImuSample), "its IMU gives no samples")
     before = _wait_for_release(board, tell) if plan.by_hand else []
     try:
@@ -293,6 +296,14 @@ def _fault(number: int) -> str:
 
 def _lets_run(message: serial.Message) -> bool:
     return isinstance(message, serial.Picture) and message.guard.state == serial.GUARD_RUN
+
+
+def _pass_over_backlog(board: Board) -> None:
+    """Read what waits from before, as while a person took the hoses off; none of it belongs into the log."""
+    began = board.port.now_s()
+    for _ in board.messages():
+        if board.port.now_s() - began > _BACKLOG_S:
+            return
 
 
 def _wait_for(board: Board, there: Callable[[serial.Message], bool], lacks: str) -> None:

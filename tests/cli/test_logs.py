@@ -288,6 +288,23 @@ def test_a_board_that_computes_something_else_fails(calib, rig: Path, tmp_path: 
     assert json.loads(ended.out)["check"]["gate"] == ["tick 19 is the first that differs, in q_m"]
 
 
+def test_a_port_that_another_program_reads(calib, tmp_path: Path) -> None:
+    ends = pty.openpty()
+    with serial.Serial(os.ttyname(ends[1]), exclusive=True):
+        ended = calib("record", os.ttyname(ends[1]), "-o", tmp_path / "log.csv", "--duration", "1s")
+    for end in ends:
+        os.close(end)
+    assert ended.code == 3 and "cannot be opened: another program has it open" in ended.sentence
+
+
+def test_a_full_disk_is_named(calib, rig: Path, board) -> None:
+    port = board(_stream(make_header(Rig.load(rig), "rig.yaml"), 300))
+    ended = calib("record", port, "-o", "/dev/full", "--duration", "4s")
+    assert ended.code == 3 and ended.sentence.endswith(
+        "/dev/full: cannot be written: No space left on device"
+    )
+
+
 def test_a_board_that_falls_silent(calib, rig: Path, tmp_path: Path, board, monkeypatch) -> None:
     monkeypatch.setattr("calib.cli.record._FELL_SILENT_S", 0.3)
     log, port = tmp_path / "log.csv", board(_stream(make_header(Rig.load(rig), "rig.yaml"), 30))
@@ -300,6 +317,15 @@ def test_a_port_that_is_not_there(calib, tmp_path: Path) -> None:
     ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "log.csv")
     assert ended.code == 3
     assert "ttyNone: cannot be opened" in ended.sentence
+    # An empty log is that of an experiment that was ended before its first sample.
+    logs = tmp_path / "rig" / "logs"
+    logs.mkdir(parents=True)
+    (logs / "static1.csv").touch()
+    ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "rig", "--do", "all")
+    assert "ttyNone: cannot be opened" in ended.sentence
+    (logs / "static1.csv").write_text("t_s,u_px,v_px\n3.5,1,1\n")
+    ended = calib("record", tmp_path / "ttyNone", "-o", tmp_path / "rig", "--do", "all")
+    assert "static1.csv: has 3.5 s, expected 60 s: a recording that was cut" in ended.sentence
     port = tmp_path / "bytes.bin"
     port.write_bytes(b"\xa5\x5a")
     ended = calib("record", port, "-o", tmp_path / "log.csv")

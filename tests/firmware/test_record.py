@@ -54,8 +54,9 @@ def _do(
     path: Path,
     level: float = 1.0,
     between: Callable[[], None] = lambda: None,
+    waits_s: float = 0.0,
 ) -> tuple[Done, list[str]]:
-    """Record an experiment; what was told. `between` runs with each line of the log."""
+    """Record an experiment, begun late; what was told. `between` runs with each line of the log."""
     words: list[str] = []
 
     def tell(said: str) -> None:
@@ -64,6 +65,8 @@ def _do(
 
     board = Board(simulated, "board")
     simulated.hear(plan.asks)
+    simulated.run(waits_s)
+    began_s = simulated.time_s
     with path.open("w") as stream:
 
         def write(text: str) -> None:
@@ -71,6 +74,8 @@ def _do(
             between()
 
         done = perform(board, plan, level, write, tell)
+    # Nothing of what came before it began is in the log.
+    assert simulated.time_s - began_s >= done.seconds
     return done, words
 
 
@@ -95,7 +100,7 @@ def test_no_sample_of_the_imu_comes_twice(bare: Built, tmp_path: Path, seed: int
     """Whatever the sensor's clock is: it starts with 100 new rates a second, as many as are read."""
     simulated, drives = SimulatedBoard(bare, seed=seed), []
     plan = replace(EXPERIMENTS["static"], seconds=4.0)
-    _do(simulated, plan, tmp_path / "log.csv", between=lambda: drives.append(simulated.duty))
+    _do(simulated, plan, tmp_path / "log.csv", between=lambda: drives.append(simulated.duty), waits_s=1.0)
     # At rest, without commands, the pumps stay off.
     assert set(drives) == {(0, 0)}
     columns = read_log(tmp_path / "log.csv").columns
