@@ -62,9 +62,9 @@ _LATER = 0.15
 up to a period after their last sample was taken."""
 _AT_ONCE = 0.05
 """Share of bursts that are taken to be read at once, or sooner for jitter."""
-_WHEN_FULL = 0.2
+_WHEN_FULL = 0.12
 """Robust deviation, in periods, of how late bursts are that are read when a buffer is full; of those that are
-read at any time within a period it is 0.37."""
+read at any time within a period it is 0.37, and 0.18 of 40 whose wander was followed."""
 _WINDOW = 11
 _LOOKS = 7
 """Looks, at most, at whether gaps are in their places."""
