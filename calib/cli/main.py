@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
+import logging
 import os
 import re
 import sys
@@ -43,6 +44,9 @@ def main() -> NoReturn:
     with warnings.catch_warnings():
         if not sys.warnoptions and not debug:
             warnings.simplefilter("ignore")
+        if not debug:
+            # It has much to say of a home that it cannot write to, and draws as well without one.
+            logging.getLogger("matplotlib").setLevel(logging.ERROR)
         interrupts = Interrupts()
         with interrupts.taken(_leave):
             code = _flushed(_run(debug, interrupts))

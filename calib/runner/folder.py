@@ -142,7 +142,7 @@ def read_folder(root: Path, follow_links: bool = False, options: LogOptions = NO
     if not (pictures or plane or logs):
         raise BadInputError(
             f"{shown(root)}: holds no pictures in images/ and no logs in logs/, found "
-            f"{_names(_entries(root)) or 'nothing'}; see calib run --help"
+            f"{_names(_entries(root)) or 'nothing'}; {left_out[0] if left_out else 'see calib run --help'}"
         )
     return Folder(root, pictures, board, plane, plane_board, tuple(logs), rig, tuple(left_out), options)
 

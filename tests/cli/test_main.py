@@ -317,6 +317,13 @@ def test_whole_installation(capsys: pytest.CaptureFixture[str]) -> None:
     assert "numpy" in said and said.endswith("verdict: ok\n")
 
 
+@pytest.mark.slow
+def test_a_home_that_cannot_be_written_is_no_matter(process) -> None:
+    nowhere = "/dev/null/home"
+    done = process("doctor", "--quick", HOME=nowhere, XDG_CONFIG_HOME=nowhere, XDG_CACHE_HOME=nowhere)
+    assert (done.code, done.err) == (0, "") and done.out.endswith("verdict: ok\n")
+
+
 def test_missing_library_ends_with_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -393,6 +393,11 @@ def test_links_out_of_the_folder_are_left_out_and_named(tmp_path: Path) -> None:
     assert any("link out of the folder" in sentence for sentence in folder.left_out)
     followed = read_folder(root, follow_links=True)
     assert [log.slug for log in followed.logs] == ["linked", "one", "two", "within"]
+    # Where there is nothing else, the sentence on the folder says so.
+    for path in (*root.glob("images/[ab].png"), *root.glob("logs/*.csv")):
+        path.unlink()
+    with pytest.raises(BadInputError, match=r"found .*; images/c\.png: is a link out of the folder"):
+        read_folder(root)
 
 
 def test_logs_of_one_stem_have_states_of_their_own(tmp_path: Path) -> None:
@@ -449,7 +454,7 @@ def test_what_is_not_where_it_is_expected_is_named(tmp_path: Path) -> None:
     other = tmp_path / "other"
     (other / "Images").mkdir(parents=True)
     if not (other / "images").is_dir():
-        with pytest.raises(BadInputError, match="found Images; see"):
+        with pytest.raises(BadInputError, match="found Images; Images: was left out, expected"):
             read_folder(other)
 
 
