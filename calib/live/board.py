@@ -60,6 +60,7 @@ class Board:
     _process: subprocess.Popen[str] | None = None
     _heads: list[str] = field(default_factory=list)
     _read: int = 0
+    _there: set[Path] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _rows: deque[list[float | None]] = field(default_factory=lambda: deque(maxlen=4000))
 
@@ -75,9 +76,9 @@ class Board:
         if name not in PROGRAMME:
             raise BadInputError(f"there is no recording {name[:40]!r}, expected {', '.join(PROGRAMME)}")
         with self._lock:
-            self.path, self.last = self.album.new_log(name), ""
-            self._heads, self._read = [], 0
-            self._rows.clear()
+            self.last = ""
+            self._begin(self.album.new_log(name))
+            self._there = set(self.album.logs.iterdir())
         words = ["record", self.port, "-o", str(self.path), "--duration", _duration(name), "--json"]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "calib", *words],
@@ -122,10 +123,18 @@ class Board:
             self._process = None
             return True
 
+    def _begin(self, path: Path) -> None:
+        self.path, self._heads, self._read = path, [], 0
+        self._rows.clear()
+
     def _more(self) -> None:
-        """Rows that the log has got since it was last read."""
+        """Rows that the log has got since it was last read, of the board's last start."""
         if self.path is None or not self.path.exists():
             return
+        # As `calib record` names the log of a further start.
+        if new := set(self.album.logs.glob(f"{self.path.stem.split('-')[0]}-*.csv")) - self._there:
+            self._there |= new
+            self._begin(max(new))
         with self.path.open("rb") as stream:
             stream.seek(self._read)
             data = stream.read(1 << 20)

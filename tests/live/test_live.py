@@ -900,6 +900,17 @@ def test_a_board_is_recorded_from_the_page(tmp_path: Path) -> None:
     assert len(read_log(tmp_path / "rig" / "logs" / "static1.csv").t_s) > 50
 
 
+def test_of_a_board_that_restarts_its_last_start_is_shown(tmp_path: Path) -> None:
+    record = server.Board(Album(tmp_path), "port")
+    record.path = record.album.new_log("static")
+    for name, shown_s in (("static1", 1.0), ("static1-2", 0.5), ("static1-3", 0.25)):
+        rows = "".join(f"{t_s},5.0,6.0\n" for t_s in (0.0, shown_s))
+        record.path.with_name(f"{name}.csv").write_text(f"t_s,u_px,v_px\n{rows}")
+        told = record.shown()
+        assert told["seconds"] == round(shown_s, 1) and len(told["plots"][0]["rows"]) == 2
+    assert record.path.name == "static1-3.csv"
+
+
 def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
     """A fake camera shows the board where a session asks for it; the page, reloaded, knows everything."""
     person = Person(np.random.default_rng(0))
