@@ -253,8 +253,6 @@ def replacing(path: Path, kind: Kind | None = None, durable: bool = True) -> Ite
             with target.open("wb") as stream:
                 yield stream
             return
-        if kind is not None:
-            _check_replaced(path, target, kind)
         _sweep(target.parent)
         with _beside(target) as (stream, temporary):
             yield stream
@@ -266,6 +264,9 @@ def replacing(path: Path, kind: Kind | None = None, durable: bool = True) -> Ite
                 )
             if durable:
                 os.fsync(stream.fileno())
+            # Another process may have written there meanwhile.
+            if kind is not None:
+                _check_replaced(path, target, kind)
             _take_over(target, temporary)
             if os.name == "nt":
                 stream.close()

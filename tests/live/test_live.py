@@ -356,6 +356,12 @@ def test_pictures_are_never_written_over_and_an_earlier_session_goes_on(
     album.describe(BoardFile(corners=[7, 5], square_m=0.02))
     with pytest.raises(BadInputError, match="is there, and is not a picture"):
         album.add(names[0], b"\x89PNG")
+    # Of another session in the same folder, while this one writes.
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(BadInputError, match="is there, and is not"):
+        patch.setattr(os, "fsync", lambda _: (album.images / "x.png").write_bytes(b"another"))
+        album.add("x.png", b"\x89PNG")
+    assert (album.images / "x.png").read_bytes() == b"another"
+    (album.images / "x.png").unlink()
     assert album.drop(names[4]) and album.left_out() == [names[4]] and album.new_name() == "view006.png"
     with pytest.raises(BadInputError, match="is there already"):
         shutil.copy(album.dropped / names[4], album.images / names[4])
