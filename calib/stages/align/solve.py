@@ -823,9 +823,10 @@ def start(pieces: Sequence[Piece], logs: Sequence[AlignLog], usual_offset_s: flo
 # together, is a total least squares: right on the average while the motion is left free (Van Huffel and
 # Vandewalle 1991).
 #
-# The noise is found on the way: the tracker's jitter and its share of outliers by maximum likelihood, the
-# IMU's from the residuals, sum w r^2 / (n - d), where d = tr(W J P J') are the degrees of freedom that
-# the fit took from the sensor; the trace comes from random signs (Hutchinson 1990).
+# The noise is found on the way: the IMU's from the residuals, sum w r^2 / (n - d), where d = tr(W J P J') are
+# the degrees of freedom that the fit took from the sensor; the trace comes from random signs (Hutchinson
+# 1990). The tracker's share of outliers and its jitter are those of maximum likelihood, the latter times
+# sqrt(n / (n - d)), n the number of exact readings that say as much.
 
 _MOST_STEPS = 100
 """Noise and fit follow each other: a change of the noise leaves three quarters of it to the next, or less."""
@@ -857,39 +858,75 @@ class Fit:
     arrow: Arrow
 
 
+def _taken(
+    arrow: Arrow, cs: list[FloatArray], size: int, rooted: Callable[[int], Iterable[tuple[Rows, FloatArray]]]
+) -> float:
+    """Degrees of freedom that the fit took from readings of a kind, by `_PROBES` vectors of random signs.
+
+    Parameters
+    ----------
+    size : of s. rooted : of a stretch, rows with the square roots (k, channels) of their weights.
+    """
+    rng, both = np.random.default_rng(0), np.array([-1, 1], dtype=np.int8)
+    to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in range(_PROBES)], np.zeros((_PROBES, size))
+    for i in range(len(cs)):
+        for rows, root in rooted(i):
+            for to_c, to in zip(to_cs, to_s, strict=True):
+                signed = root * rng.choice(both, root.shape)
+                gathered(rows.span, rows.basis, rows.by, signed, to_c[i], to)
+    taken = 0.0
+    for to_c, to in zip(to_cs, to_s, strict=True):
+        dcs, ds = arrow.solve(to_c, to)
+        taken += sum(float(a @ b) for a, b in zip(dcs, to_c, strict=True)) + float(ds @ to)
+    return taken / _PROBES
+
+
 def _imu_noise(
     problem: Problem, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise
 ) -> tuple[FloatArray, FloatArray]:
     """Deviations (3,) of the IMU's readings by residuals and degrees of freedom, and counts over these."""
-    rng, both = np.random.default_rng(0), np.array([-1, 1], dtype=np.int8)
     squares, count, taken = np.zeros(3), np.zeros(3), np.zeros(3)
     # One channel at a time: each probe takes the memory of all coefficients.
     for channel in range(3):
-        signs = [
-            [rng.choice(both, len(stretch.imu_s)) for stretch in problem.stretches] for _ in range(_PROBES)
-        ]
-        to_cs, to_s = [[np.zeros(c.size) for c in cs] for _ in signs], np.zeros((_PROBES, len(s)))
-        for i, (stretch, c) in enumerate(zip(problem.stretches, cs, strict=True)):
-            done = 0
-            for off, rows, part in _readings(stretch, c, s):
-                deviation = noise.of(stretch, part)
+
+        def rooted(i: int, channel: int = channel) -> Iterator[tuple[Rows, FloatArray]]:
+            for off, rows, part in _readings(problem.stretches[i], cs[i], s):
+                deviation = noise.of(problem.stretches[i], part)
                 _, pull, weight = imu_terms(off, deviation)
                 # Beyond `HUBER` deviations a reading counts as one there: a few wild ones are no noise.
                 squares[channel] += ((pull[:, channel] * deviation[:, channel]) ** 2).sum()
                 count[channel] += (weight[:, channel] > 0.0).sum()
-                root = np.where(np.arange(3) == channel, np.sqrt(weight), 0.0)
-                for probe in range(_PROBES):
-                    signed = root * signs[probe][i][done : done + len(off), None]
-                    gathered(rows.span, rows.basis, rows.by, signed, to_cs[probe][i], to_s[probe])
-                done += len(off)
-        for to_c, to in zip(to_cs, to_s, strict=True):
-            dcs, ds = arrow.solve(to_c, to)
-            own = sum(float(a @ b) for a, b in zip(dcs, to_c, strict=True))
-            taken[channel] += own + float(ds @ to)
-    left = np.maximum(count - taken / _PROBES, 1.0)
+                yield rows, np.where(np.arange(3) == channel, np.sqrt(weight), 0.0)
+
+        taken[channel] = _taken(arrow, cs, len(s), rooted)
+    left = np.maximum(count - taken, 1.0)
     found = noise.imu * np.sqrt(squares / left)
     # Without readings of an axis its deviation plays no part.
     return np.where(count > 20, np.maximum(found, 1e-6), noise.imu), count / left
+
+
+_MOST_TAKEN = 0.5
+"""Share of what pictures say that counts as taken at most: of whole pixels with little jitter, which leave
+next to no residuals, next to all."""
+
+
+def _jitter_px(
+    problem: Problem, arrow: Arrow, cs: list[FloatArray], s: FloatArray, noise: Noise, share: float
+) -> float:
+    """The tracker's jitter by residuals and the degrees of freedom that the fit took from them."""
+    offs = [pictures_off(problem, stretch, c, s) for stretch, c in zip(problem.stretches, cs, strict=True)]
+    count = 0.0
+
+    def rooted(i: int) -> Iterator[tuple[Rows, FloatArray]]:
+        nonlocal count
+        for rows, _, _, weight, _ in _picture_terms(problem, noise, problem.stretches[i], cs[i], s):
+            # As many exact readings would say as much.
+            count += noise.jitter_px**2 * float(weight.sum())
+            yield rows, np.sqrt(weight)
+
+    taken = _taken(arrow, cs, len(s), rooted)
+    left = 1.0 - min(taken / max(count, 1.0), _MOST_TAKEN)
+    return best_jitter_px(np.concatenate(offs), problem.grid_px, share) / math.sqrt(left)
 
 
 _AGES_S = np.concatenate([[0.0], np.geomspace(5e-5, 3e-3, 42)])
@@ -923,8 +960,7 @@ def _renewed(
 ) -> Noise:
     good = np.concatenate(goods)
     share = float(np.clip(1.0 - good.mean() if len(good) else 0.0, 1e-3, 0.5))
-    offs = [pictures_off(problem, stretch, c, s) for stretch, c in zip(problem.stretches, cs, strict=True)]
-    jitter = best_jitter_px(np.concatenate(offs), problem.grid_px, share)
+    jitter = _jitter_px(problem, arrow, cs, s, noise, share)
     imu, lost = _imu_noise(problem, arrow, cs, s, noise)
     return Noise(jitter, share, imu, _age_s(problem, cs, s, imu, lost))
 
