@@ -37,7 +37,6 @@ from calib.stages.camera.pose import (
     plane_map,
     plane_pixels,
     pose_derivatives,
-    projection_with_derivatives,
 )
 
 THESIS = Camera(
@@ -270,27 +269,6 @@ T_TRUE_POSE = np.array([0.01, -0.012, 0.33])
 
 def pixels_of(camera: Camera) -> np.ndarray:
     return project(camera, POINTS_POSE @ R_TRUE_POSE[:, :2].T + T_TRUE_POSE)
-
-
-@pytest.mark.parametrize("model", ["rational8", "fisheye4"])
-def test_derivatives_against_finite_differences(model: str) -> None:
-    camera = replace(RICH, model=model)
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-0.15, 0.15, (40, 2)), rng.uniform(0.2, 0.6, 40)])
-    pixels, by_point, by_camera = projection_with_derivatives(camera, points)
-    assert np.abs(pixels - project(camera, points)).max() < 1e-11
-    for axis in range(3):
-        d = np.zeros(3)
-        d[axis] = 1e-7
-        numeric = (project(camera, points + d) - project(camera, points - d)) / 2e-7
-        assert np.abs(by_point[:, :, axis] - numeric).max() < 1e-4 * np.abs(by_point).max()
-    c = vector_from_camera(camera)
-    for index in range(13):
-        d = np.zeros(13)
-        d[index] = 1e-5 * max(1.0, abs(c[index]))
-        plus, minus = (camera_from_vector(model, camera.image_size_px, c + s * d) for s in (1, -1))
-        numeric = (project(plus, points) - project(minus, points)) / (2 * d[index])
-        assert by_camera[:, :, index] == pytest.approx(numeric, rel=1e-6, abs=1e-6)
 
 
 def test_pose_derivatives_against_finite_differences() -> None:

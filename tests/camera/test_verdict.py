@@ -580,7 +580,6 @@ def test_a_bad_view_and_bad_points_are_found() -> None:
     found = _told(views)
     assert any(one.startswith("v02 (") and "does not fit the other views" in one for one in found.reasons)
     assert any("1 point lies" in one and "in v07 (" in one for one in found.remarks)
-    assert any("The worst percent of the points holds" in one for one in found.remarks)
 
 
 def test_errors_printed_on_the_board_repeat() -> None:

@@ -64,14 +64,6 @@ def hull_area(points: FloatArray) -> float:
     return float(0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
 
-def inside_hull(points: FloatArray, corners: FloatArray) -> BoolArray:
-    """Which points (n, 2) lie inside a convex polygon (H, 2)."""
-    side = np.roll(corners, -1, axis=0) - corners
-    offset = points[:, None] - corners
-    turn = side[:, 0] * offset[..., 1] - side[:, 1] * offset[..., 0]
-    return np.asarray(np.all(turn >= -1e-9, axis=1) | np.all(turn <= 1e-9, axis=1))
-
-
 def target_box(calibration: bundle.Calibration) -> FloatArray:
     """Corners (4, 3) of the box around all points of the target, on its plane."""
     observations = calibration.observations
@@ -669,20 +661,15 @@ def drift(calibration: bundle.Calibration) -> FloatArray | None:
 
 def _step(found: Evidence, t: FloatArray) -> tuple[FloatArray, bool]:
     """Change (P,) of the intrinsics for one unit of t (N,), and whether some of it is certain."""
-    P = found.intrinsics
-    late, later = np.einsum("n,ngh->gh", t, found.S)[:, :P], np.einsum("n,ngh->gh", t**2, found.S)[:P, :P]
-    S = np.block([[found.S.sum(axis=0), late], [late.T, later]])
-    b = np.concatenate([found.b.sum(axis=0), t @ found.b[:, :P]])
-    inverse = scaled_inverse(S, 1e-12)
-    whole = -inverse @ b
-    common, step = whole[:-P], whole[-P:]
-    moved = common + t[:, None] * np.concatenate([step, np.zeros(len(common) - P)])
+    P, G = found.intrinsics, len(found.names)
+    # All parameters, and the intrinsics once more in proportion to t.
+    A = np.concatenate([np.tile(np.eye(G), (len(t), 1, 1)), t[:, None, None] * np.eye(P, G)], axis=1)
+    S, b = A @ found.S @ A.transpose(0, 2, 1), (A @ found.b[..., None])[..., 0]
+    one = replace(found, S=S, b=b).solved(1e-12)
     # Scatter of the views about what they run along.
-    about = replace(found, b=found.b + np.einsum("ngh,nh->ng", found.S, moved))
-    freedom = int((found.measured - 6).sum()) - 2 * P
-    left = max(float(found.cost.sum()) - float(gain(S, b)), 0.0) / max(freedom, 1)
-    sigma = np.sqrt(np.maximum(np.diag(inverse)[-P:], 0.0) * left) * overdispersion(about)
-    return step, bool(np.any(np.abs(step) > CERTAIN * sigma))
+    about = replace(found, b=found.b + np.einsum("ngh,nh->ng", found.S, one.step @ A))
+    sigma = np.sqrt(np.maximum(np.diag(one.inverse)[-P:], 0.0) * one.variance) * overdispersion(about)
+    return one.step[-P:], bool(np.any(np.abs(one.step[-P:]) > CERTAIN * sigma))
 
 
 def scatter_beyond(found: Evidence, inflation: float) -> list[FloatArray]:

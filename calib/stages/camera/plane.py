@@ -727,20 +727,17 @@ def settle_orientation(
         Where the rule cannot decide, and where no corner that can be the first is near `first_corner_px`.
     """
     candidates = turns_of(pixels, board)
+    degrees_of = [_wrapped_deg(_world_x_direction(turned, board, angle_rad)) for _, turned in candidates]
     if first_corner_px is not None:
-        return _settle_by_pixel(candidates, board, angle_rad, first_corner_px, name)
+        return _settle_by_pixel(candidates, degrees_of, board, first_corner_px, name)
 
-    directions = [_world_x_direction(turned, board, angle_rad) for _, turned in candidates]
-    off = np.abs([_wrapped_deg(direction) for direction in directions])
-    order = np.argsort(off)
-    best = int(order[0])
-    turn, chosen = candidates[best]
-    degrees = _wrapped_deg(directions[best])
-    if off[order[1]] - off[best] < 2 * _UNDECIDED_DEG:
+    best, second, *_ = np.argsort(np.abs(degrees_of)).tolist()
+    (turn, chosen), degrees = candidates[best], degrees_of[best]
+    if abs(degrees_of[second]) - abs(degrees) < 2 * _UNDECIDED_DEG:
         raise BadInputError(
-            f"{name}: the world's x axis would point {degrees:.1f} or "
-            f"{_wrapped_deg(directions[int(order[1])]):.1f} degrees from the picture's right, so the first "
-            "corner cannot be told; give first_corner_px: [u, v] in board.yaml"
+            f"{name}: the world's x axis would point {degrees:.1f} or {degrees_of[second]:.1f} degrees from "
+            "the picture's right, so the first corner cannot be told; give first_corner_px: [u, v] in "
+            "board.yaml"
         )
     limit = 90 if len(candidates) == 2 else 45
     tells = not board.half_turn_looks_the_same
@@ -775,8 +772,8 @@ def _words(degrees: float) -> str:
 
 def _settle_by_pixel(
     candidates: list[tuple[int, FloatArray]],
+    degrees_of: Sequence[float],
     board: Board,
-    angle_rad: float,
     first_corner_px: Sequence[float],
     name: str,
 ) -> Placement:
@@ -792,10 +789,9 @@ def _settle_by_pixel(
             f"{name}: first_corner_px is [{wanted[0]:g}, {wanted[1]:g}], but the corners that can be the "
             f"first are seen at {seen}; expected one within half a square ({limit:.1f} px)"
         )
-    degrees = _wrapped_deg(_world_x_direction(chosen, board, angle_rad))
     how = (
         f"Corner (0, 0) was taken at pixel ({chosen[0, 0]:.1f}, {chosen[0, 1]:.1f}), {distances[best]:.1f} "
-        f"px from first_corner_px; the world's x axis points {degrees:.1f} degrees from the picture's right "
-        "(positive is down)."
+        f"px from first_corner_px; the world's x axis points {degrees_of[best]:.1f} degrees from the "
+        "picture's right (positive is down)."
     )
     return Placement(chosen, turn, how)

@@ -23,7 +23,6 @@ from dataclasses import replace
 import numpy as np
 
 from calib.core.arrays import BoolArray, FloatArray, evenly
-from calib.core.geometry import box_grid
 from calib.core.verdict import Finding, Severity, Verdict
 from calib.core.words import several
 from calib.stages.camera import bundle, checks
@@ -44,17 +43,16 @@ class Limits:
         perspective alone, which goes with the tilt.
     area_poor : share of the image that the points span.
     view_poor : share of the image that a typical view spans.
-    projection_share : standard deviation of projection inside of what was seen, over the width.
-    border_share : the same at the picture's border; poor where half of it is worse.
+    border_share : standard deviation of projection at the picture's border, over the width; poor where half
+        of it is worse.
     centre_poor, centre_remark : offset of the principal point from the image's centre, over its side; of a
         cropped picture it may be larger.
     lens_remark, lens_poor, lens_poor_px : share, and pixels, of the RMS that a richer lens model would
         take away.
     rms_px : residuals above which something is wrong whatever it is, at up to 1000 pixels' width.
-    view_bad, view_remark : RMS of a view over the others'.
+    view_bad : RMS of a view over the others'.
     point_factor, point_floor_px, points_poor : a point off by this many medians and pixels is an
         outlier; share of outliers.
-    heavy_remark : share of the squared residuals that the worst percent of points may hold.
     repeated_remark : error that repeats at the same points over what independent errors leave.
     change_times, change_poor_px, change_remark_px : RMS over what it would be if each view had a camera of
         its own, and the part of it that this would take away, px at up to 1000 pixels' width. Public sets
@@ -90,7 +88,6 @@ class Limits:
     spread_free_deg = 5.0
     area_poor = 0.20
     view_poor = 0.01
-    projection_share = 0.002
     border_share = 0.01
     centre_poor = 0.15
     centre_remark = 0.10
@@ -99,11 +96,9 @@ class Limits:
     lens_poor_px = 0.1
     rms_px = 1.0
     view_bad = 5.0
-    view_remark = 3.0
     point_factor = 8.0
     point_floor_px = 0.5
     points_poor = 0.01
-    heavy_remark = 0.2
     repeated_remark = 1.6
     change_times = 1.5
     change_poor_px = 0.1
@@ -175,9 +170,8 @@ def _of_solution(calibration: bundle.Calibration) -> Iterator[Finding]:
 
 
 def _of_lens(calibration: bundle.Calibration) -> Iterator[Finding]:
-    """The radial curve has to rise over the image, and the focal length has to be a lens's."""
+    """The radial curve has to rise over the image."""
     camera, found = calibration.camera, checks.lens_shape(calibration)
-    width = max(camera.image_size_px)
     if found.folds_among_points:
         text = (
             "The distortion curve folds over among the points that were seen, so that two directions share "
@@ -196,44 +190,19 @@ def _of_lens(calibration: bundle.Calibration) -> Iterator[Finding]:
         )
         inside = found.reach <= 1.0 or found.image_shown < 1.0
         yield Finding("poor" if inside else "remark", text, _IN_CORNERS)
-    focal = min(camera.fx_px, camera.fy_px)
-    # A fisheye lens of 0.16 shows all directions within the width; its circle may be smaller than that.
-    shortest = 0.1 if camera.fisheye else 0.25
-    if not shortest * width < focal < 30 * width:
-        text = (
-            f"The focal length of {focal:.1f} px is {focal / width:.2f} times the picture's width; "
-            f"lenses that this model suits have {shortest:g} to 30."
-        )
-        free = not 0.6 * shortest * width < focal < 100 * width
-        yield Finding("unidentifiable" if free else "poor", text, _MORE_TILT)
-
-
-def _known(sigma_share: float) -> str:
-    return f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
 
 
 def _of_focal(sigma_share: float) -> Iterator[Finding]:
     """Standard deviation of the focal length, inflated."""
     if sigma_share >= Limits.focal_remark:
+        known = f"{100 * sigma_share:.1f} %" if sigma_share < 2 else "no better than a factor of two"
         text = (
-            f"The focal length is known to {_known(sigma_share)} (one standard deviation, residuals that are "
+            f"The focal length is known to {known} (one standard deviation, residuals that are "
             f"not white considered; up to {100 * Limits.focal_poor:.0f} is good, "
             f"{100 * Limits.focal_free:.0f} means that it is free)."
         )
         kind: Severity = "remark" if sigma_share < Limits.focal_poor else "poor"
         yield Finding(kind if sigma_share < Limits.focal_free else "unidentifiable", text, _MORE_TILT)
-
-
-def _of_denominator(sigma_share: float) -> Iterator[Finding]:
-    """What the rational model's denominator costs the focal length when it is free as well."""
-    if sigma_share >= Limits.focal_poor:
-        text = (
-            f"The coefficients k4, k5 and k6 are not determined; with them free the focal length is known to "
-            f"{_known(sigma_share)} (up to {100 * Limits.focal_free:.0f} does not matter, as distortion "
-            "makes up for it)."
-        )
-        kind: Severity = "remark" if sigma_share < Limits.focal_free else "poor"
-        yield Finding(kind, text, "Use a simpler lens model.")
 
 
 def _of_richer(fit: bundle.Calibration, wide: bundle.Calibration) -> Iterator[Finding]:
@@ -246,26 +215,6 @@ def _of_richer(fit: bundle.Calibration, wide: bundle.Calibration) -> Iterator[Fi
         )
         serious = drop > Limits.lens_poor and fit.rms_px - wide.rms_px > Limits.lens_poor_px
         yield Finding("poor" if serious else "remark", text, "Use a richer lens model.")
-
-
-def _of_projection(fit: bundle.Calibration, known: bundle.Covariance) -> Iterator[Finding]:
-    """Standard deviation of projection where points were seen."""
-    outline = checks.hull(fit.observations.pixels[fit.observations.present])
-    grid = box_grid([*outline.min(axis=0), *outline.max(axis=0)], 14, 12).reshape(-1, 2)
-    inside = grid[checks.inside_hull(grid, outline)]
-    spread = bundle.projection_sigma_px(fit, known, inside)
-    bounded = spread[~np.isnan(spread)]
-    sigma_px = float(np.median(bounded)) if len(bounded) else np.inf
-    limit = Limits.projection_share * max(fit.camera.image_size_px)
-    if sigma_px > limit:
-        text = (
-            f"Where points were seen the camera predicts pixels to {sigma_px:.2f} px only "
-            f"(median standard deviation; {limit:.2f} is good)."
-        )
-        # More than the picture's side says as little as infinity.
-        if not sigma_px < max(fit.camera.image_size_px):
-            text = "Where points were seen nothing bounds the error of the pixels that the camera predicts."
-        yield Finding("poor", text, "Take more pictures, with the board tilted and close.")
 
 
 def _of_border(
@@ -499,30 +448,20 @@ def _of_centre(calibration: bundle.Calibration, known: bundle.Covariance) -> Ite
 
 
 def _of_misfit(calibration: bundle.Calibration) -> Iterator[Finding]:
-    """Residuals too large, bad views, bad points, and residuals that are not independent normal noise."""
+    """Residuals too large, bad views, bad points, and errors that repeat."""
     names, present = calibration.observations.names, calibration.observations.present
-    squared = np.where(present, (calibration.residuals_px**2).sum(axis=2), 0.0)
-    rms = np.sqrt(squared.sum(axis=1) / np.maximum(present.sum(axis=1), 1))
+    distance, rms = np.linalg.norm(calibration.residuals_px, axis=2), calibration.view_rms_px
     typical = float(np.median(rms))
     bad = rms > max(Limits.view_bad * quiet_rms(rms), Limits.point_floor_px)
-
-    def with_rms(which: Sequence[int]) -> str:
-        return several([f"{names[i]} ({rms[i]:.2f} px)" for i in which], 4)
-
     if bad.any():
         worse, good = [i for i in np.argsort(-rms).tolist() if bad[i]], float(np.median(rms[~bad]))
         text = (
-            f"{with_rms(worse)} {'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is "
-            f"{good:.2f} px: misplaced corners, another board, or motion during the exposure."
+            f"{several([f'{names[i]} ({rms[i]:.2f} px)' for i in worse], 4)} "
+            f"{'does' if len(worse) == 1 else 'do'} not fit the other views, whose RMS is {good:.2f} px: "
+            "misplaced corners, another board, or motion during the exposure."
         )
         advice = f"Leave out {several([names[i] for i in worse], 4)}, or look at the corners there."
         yield Finding("inconsistent", text, advice)
-    elif np.any(odd := rms > max(Limits.view_remark * typical, 0.1)):
-        text = (
-            f"{with_rms(np.flatnonzero(odd).tolist())}: RMS more than {Limits.view_remark:.0f} times that of "
-            f"a typical view ({typical:.2f} px)."
-        )
-        yield Finding("remark", text)
     limit = Limits.rms_px * scale_of(calibration.camera.image_size_px)
     if typical > limit:
         text = (
@@ -531,18 +470,9 @@ def _of_misfit(calibration: bundle.Calibration) -> Iterator[Finding]:
         )
         advice = "Look at the corners, check the number of squares and try a richer lens model."
         yield Finding("inconsistent" if typical > 3 * limit else "poor", text, advice)
-    fine = present & ~bad[:, None]
-    yield from _of_points(np.sqrt(squared), fine, names)
+    yield from _of_points(distance, present & ~bad[:, None], names)
     if (repeated := repeated_errors(calibration)) > Limits.repeated_remark:
         yield Finding("remark", f"{_REPEATED.format(repeated)}.")
-    ordered = np.sort(squared[fine])
-    heavy = float(ordered[-max(1, len(ordered) // 100) :].sum() / max(ordered.sum(), 1e-300))
-    if heavy > Limits.heavy_remark:
-        text = (
-            f"The worst percent of the points holds {100 * heavy:.0f} % of the squared error "
-            "(five is normal)."
-        )
-        yield Finding("remark", text, "Look at the corners with the largest errors, or use a robust loss.")
 
 
 def far_points(
@@ -799,8 +729,6 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
         return findings, None
     findings += _of_misfit(fit)
     sturdy = checks.conditioned(fit)
-    if sturdy is not fit:
-        findings += _of_denominator(_focal_share(fit))
     inflation = checks.overdispersion(checks.evidence(sturdy))
     # What a board of another shape moves is a matter of the board, and told of that.
     share = _focal_share(sturdy)
@@ -811,7 +739,7 @@ def _by_the_rules(calibration: bundle.Calibration) -> tuple[list[Finding], bundl
     some = _sampled(sturdy)
     findings += _of_starts(some, inflation)
     known = checks.by_the_views(calibration if sturdy is fit else sturdy)
-    findings += [*_of_centre(fit, known), *_of_projection(sturdy, known)]
+    findings += _of_centre(fit, known)
     # The lens first: a target would bend to make up for a lens that the model cannot follow.
     wide = checks.widened(some)
     shape = checks.target_shape(wide)
