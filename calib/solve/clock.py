@@ -62,9 +62,9 @@ _LATER = 0.15
 up to a period after their last sample was taken."""
 _AT_ONCE = 0.05
 """Share of bursts that are taken to be read at once, or sooner for jitter."""
-_WHEN_FULL = 0.12
-"""Robust deviation, in periods, of how late bursts are that are read when a buffer is full; of those that are
-read at any time within a period it is 0.37, and 0.18 of 40 whose wander was followed."""
+_WHEN_FULL = 0.26
+"""Robust deviation, in periods, of bursts from their line where they are read when a buffer is full; of those
+that are read at any time within a period it is 0.37."""
 _WINDOW = 11
 _LOOKS = 7
 """Looks, at most, at whether gaps are in their places."""
@@ -324,7 +324,7 @@ def _fit_stretch(t: FloatArray) -> tuple[FloatArray, IntArray, float, int] | Non
         late = t[anchors] - (origin + period * k) - wander
         # Read as a buffer is full they are late by no more than the stamps of single samples. Else the least
         # late ones tell when their last samples were taken. None was before the reading before.
-        full = robust_sigma(late) < _WHEN_FULL * period
+        full = robust_sigma(t[anchors] - (origin + period * k)) < _WHEN_FULL * period
         times += np.median(late) if full else np.quantile(late, _AT_ONCE)
         before = np.concatenate([[-math.inf], t[anchors[:-1]]])
         times = np.maximum(times, np.repeat(before, count))
