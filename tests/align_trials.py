@@ -81,10 +81,15 @@ def draw(seed: int) -> Trial:
 
 
 def twin_log(
-    rig: SimulatedRig, scenario: str, options: dict[str, str], seed: int, duration_s: float | None = None
+    rig: SimulatedRig,
+    scenario: str,
+    options: dict[str, str],
+    seed: int,
+    duration_s: float | None = None,
+    feedback: str = "truth",
 ) -> Log:
     """A log of the rig."""
-    run = run_scenario(make_scenario(scenario, options), rig, seed, "truth", duration_s)
+    run = run_scenario(make_scenario(scenario, options), rig, seed, feedback, duration_s)
     return run_log(run, f"{scenario}{seed}")
 
 

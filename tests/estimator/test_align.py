@@ -455,6 +455,16 @@ def test_what_is_read_at_rest_and_its_gradients() -> None:
 
 
 @pytest.mark.slow
+def test_scales_by_long_logs_of_a_head_that_follows_the_trackers_noise_are_in_sigma() -> None:
+    trial, scales = known(SimulatedRig()), [SENSOR.index(name) for name in ("gyro_scale", "accel_scale_y")]
+    off = []
+    for seed in (2, 3):
+        log = align_log(twin_log(trial.rig, "ellipse", {}, seed, 600.0, "sensors"))
+        off.append(scores(trial, align([log], prior_settings(trial.view)))[scales])
+    assert np.abs(off).max() < 2.0
+
+
+@pytest.mark.slow
 def test_sigma_tells_the_errors_of_rigs_that_differ() -> None:
     """Latency 10 - 40 ms, mount, lever, scales, biases, noise and plane drawn anew for each rig."""
     z, offset, mount = [], [], []

@@ -209,7 +209,7 @@ def test_a_clock_that_steps_midway_is_named() -> None:
 
 
 def test_what_a_few_rows_gain_is_no_delay() -> None:
-    """Of 76 sound logs five were said to be late, most by a sample, for the jerks of pumps."""
+    """Of 81 sound logs five were said to be late, most by a sample, for the jerks of pumps."""
     noise = np.random.default_rng(0).normal(-0.02, 0.5, 2000)
     assert throughout(noise + 0.1)
     noise[::400] += 60.0

@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x3BE7F0C4UL
+#define CALIB_ID 0xA141DED9UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -135,7 +135,7 @@
  */
 #define CALIB_PLANE_NORMALISED_11 1.00044441f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_12 -0.0241306815f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202335455f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202335548f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_21 0.0216922686f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.98737222f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_23 0.220938489f /* row 2, A^-1 K, dimensionless to m */
@@ -150,11 +150,11 @@
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
 #define CALIB_PLANE_RAW_11 0.00369091588f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82897148e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82897075e-05f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_13 -0.604360104f /* row 1, distorted px to m */
 #define CALIB_PLANE_RAW_21 7.22145851e-05f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_22 0.00363199669f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160437152f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160437137f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000437254144f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111405493f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81176996f /* row 3, distorted px to m */
@@ -165,7 +165,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), for D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.498469532f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.498469472f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -174,11 +174,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0151448203f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0682135895f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.01743066f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.0057941163f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228065848f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0151447393f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0682126507f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.01743078f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00579412002f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228065364f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -192,13 +192,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0163870901f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.49487003e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0163870882f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.49487512e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145633565f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145633817f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -220,7 +220,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0651592538f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0651592389f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -234,21 +234,21 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.50153041f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000254354876f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.90310401e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.25483086e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.80197184e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000258788437f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.75650184e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.00252008531f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000256889442f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00819354504f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.74743501e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.372298628f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.30301619f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.6060324f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00251814467f /* K_b, share of the correction */
+#define CALIB_FUSED_DELAY_TICKS 1.50153053f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000254354643f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.90308673e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.25479993e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.8019541e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000258788234f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.75647619e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00252008298f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.00025688918f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00819354411f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.74743756e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.372298658f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.30301428f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.6060286f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.0025181449f /* K_b, share of the correction */
 #define CALIB_FUSED_MOVING_LENGTH 0.187176675f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00682989322f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.00899317022f /* K_r, dimensionless */
@@ -307,19 +307,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0651592538f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0651592389f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
     99.75f, 128.208908f, 139.691147f, 149.114609f, 157.540604f, 165.444351f,
-    173.074585f, 180.595123f, 188.16568f, 195.954681f, 204.172012f, 213.173798f,
+    173.0746f, 180.595123f, 188.16568f, 195.954681f, 204.172012f, 213.173798f,
     223.76503f, 240.569534f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0451592505f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.115159251f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0451592393f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115159236f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 185 /* ticks that a pump may stay at its greatest command */

@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x7013DB3CUL
+#define CALIB_ID 0x40219AF9UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -121,12 +121,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365900062f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.85198242e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365899922f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.85197514e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_13 -0.599090099f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93372601e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362189463f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160745203f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93372237e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362189324f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160745054f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000316923106f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000871971366f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.76387095f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -135,12 +135,12 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.00046384f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241320617f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202202257f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216928273f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987392128f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220937505f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.00046349f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241320413f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202203915f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216928162f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.98739177f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220937535f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0866548419f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237714723f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62413001f /* row 3, A^-1 K, dimensionless to m */
@@ -151,12 +151,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.331 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369098736f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82956811e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.60435766f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.2216666e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363207026f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.160445958f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.0036909862f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82955937e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.6043576f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.22166224e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.0036320691f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160445794f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000437254144f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111405493f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81176996f /* row 3, distorted px to m */
@@ -167,7 +167,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), for D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.486950666f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.486951441f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -176,11 +176,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.081928581f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0317188837f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.00139105f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.00599091779f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0185199473f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 0.0821365044f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0316917934f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.00137293f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00599094806f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0185177512f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -194,13 +194,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0165459234f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.91252673e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0165459942f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.91261913e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0149981705f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.014998178f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -222,7 +222,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.0649775714f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0649775639f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -236,27 +236,27 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.51304936f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.0002595103f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 4.81335292e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 2.11086372e-05f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -4.80666677e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000259871304f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -8.63663081e-06f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.0025456287f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000259493245f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00827296171f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.95626336e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.369811594f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.26460361f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.5292072f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.0025220192f /* K_b, share of the correction */
-#define CALIB_FUSED_MOVING_LENGTH 0.186627239f /* K_m, dimensionless */
-#define CALIB_FUSED_MOVING_RATE 0.00680090766f /* K_v, per tick */
-#define CALIB_FUSED_REST_LENGTH 0.00895201322f /* K_r, dimensionless */
+#define CALIB_FUSED_DELAY_TICKS 1.51304853f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000259515946f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 4.81279949e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 2.11632068e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -4.8062011e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000259872235f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -8.63058176e-06f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00254563009f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000259493361f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.0082729971f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.95630957e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.369811684f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.26460314f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.5292063f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252201944f /* K_b, share of the correction */
+#define CALIB_FUSED_MOVING_LENGTH 0.186627284f /* K_m, dimensionless */
+#define CALIB_FUSED_MOVING_RATE 0.00680090999f /* K_v, per tick */
+#define CALIB_FUSED_REST_LENGTH 0.00895201694f /* K_r, dimensionless */
 #define CALIB_FUSED_RATE_DECAY 0.935506999f /* K_d, per tick, at rest and without a picture */
 #define CALIB_FUSED_SLOW 0.0989248976f /* K_s, dimensionless */
-#define CALIB_FUSED_MOVING_M 0.00037334385f /* s_0, mean residual of a length that moves, m */
+#define CALIB_FUSED_MOVING_M 0.000373343733f /* s_0, mean residual of a length that moves, m */
 #define CALIB_FUSED_STILL_M 7.33333354e-06f /* v_0, m per tick */
 #define CALIB_FUSED_GATE_M 0.00499999989f /* residuals beyond are left out, m */
 #define CALIB_FUSED_BOOST 0.5f /* share of the length's residual after a start */
@@ -309,18 +309,18 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.0649775714f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0649775639f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.230881f, 139.722702f, 149.154663f, 157.587662f, 165.497955f,
-    173.136826f, 180.664764f, 188.245483f, 196.046387f, 204.278671f, 213.307724f,
-    223.947174f, 241.123901f, 253.5f,
+    99.75f, 128.230881f, 139.722702f, 149.154648f, 157.587662f, 165.49794f,
+    173.136826f, 180.664764f, 188.245468f, 196.046371f, 204.278656f, 213.307709f,
+    223.947144f, 241.12381f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0449775681f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0449775644f /* shortest length of a bellows, m */
 #define CALIB_ENVELOPE_GREATEST_M 0.114977568f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */

@@ -78,7 +78,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xCAA687D2UL
+#define CALIB_ID 0xD035E198UL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -119,12 +119,12 @@
 /* Plane of the actuator, without the shift and stretch that align has found. */
 #define CALIB_HAS_PLANE 1 /* for #if */
 #define CALIB_PLANE_OK 1 /* 0: the plane failed its gate */
-#define CALIB_PLANE_INVERSE_11 0.00365896057f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_12 -8.85216214e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_13 -0.59907192f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_21 7.93361687e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_22 0.00362185529f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
-#define CALIB_PLANE_INVERSE_23 -0.160740525f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_11 0.00365896011f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_12 -8.85215413e-05f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_13 -0.599072099f /* row 1, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_21 7.93361542e-05f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_22 0.00362185482f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
+#define CALIB_PLANE_INVERSE_23 -0.160740465f /* row 2, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_31 -0.000316923106f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_32 -0.000871971366f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
 #define CALIB_PLANE_INVERSE_33 3.76387095f /* row 3, A^-1, undistorted px to m; (2.11), for programs of your own */
@@ -133,12 +133,12 @@
  * The same from normalised undistorted coordinates, for CALIB_UNDISTORT 1. Row 3 gives 1/s of (2.12) in 1/m, the
  * reciprocal depth.
  */
-#define CALIB_PLANE_NORMALISED_11 1.000453f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_12 -0.0241325498f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.02020864f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_21 0.0216925275f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_22 0.987381458f /* row 2, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_23 0.220938012f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_11 1.00045276f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_12 -0.0241325293f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.0202088915f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_21 0.0216925237f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_22 0.987381279f /* row 2, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_23 0.220938027f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_31 -0.0866548419f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_32 -0.237714723f /* row 3, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_33 3.62413001f /* row 3, A^-1 K, dimensionless to m */
@@ -149,12 +149,12 @@
  * CALIB_UNDISTORT 0. Neglecting the lens costs up to 0.331 mm there.
  */
 #define CALIB_HAS_RAW_PLANE 1 /* 0: the workspace is not in sight */
-#define CALIB_PLANE_RAW_11 0.00369094685f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_12 -8.82982349e-05f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_13 -0.604339242f /* row 1, distorted px to m */
-#define CALIB_PLANE_RAW_21 7.22155528e-05f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_22 0.00363203092f /* row 2, distorted px to m */
-#define CALIB_PLANE_RAW_23 -0.16044125f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_11 0.00369094615f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_12 -8.82981476e-05f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_13 -0.604339421f /* row 1, distorted px to m */
+#define CALIB_PLANE_RAW_21 7.2215531e-05f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_22 0.00363203022f /* row 2, distorted px to m */
+#define CALIB_PLANE_RAW_23 -0.160441175f /* row 2, distorted px to m */
 #define CALIB_PLANE_RAW_31 -0.000437254144f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_32 -0.00111405493f /* row 3, distorted px to m */
 #define CALIB_PLANE_RAW_33 3.81176996f /* row 3, distorted px to m */
@@ -165,7 +165,7 @@
 #define CALIB_TICK_RATE_MHZ 60000 /* the same in millihertz, for #if */
 #define CALIB_HOLD_TICKS 60 /* a sensor that is silent for longer, a second, stops the pumps */
 #define CALIB_TIME_OFFSET_TICKS 2 /* ceil(D), for D ticks by which a picture is later than the IMU */
-#define CALIB_TIME_OFFSET_PART 0.516222417f /* ceil(D) - D, share of a tick */
+#define CALIB_TIME_OFFSET_PART 0.516221046f /* ceil(D) - D, share of a tick */
 
 /*
  * IMU on the head, x from the head to the base at rest; phi = atan2(RATIO ay, ax) - mount (2.1),
@@ -174,11 +174,11 @@
 #define CALIB_IMU_SIGN_AX 1 /* 1 or -1, of ax as the sensor gives it */
 #define CALIB_IMU_SIGN_AY 1 /* 1 or -1, of ay */
 #define CALIB_IMU_SIGN_GZ 1 /* 1 or -1, of gz */
-#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0142322062f /* subtracted from ax, m/s^2 */
-#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0697099715f /* subtracted from ay, m/s^2 */
-#define CALIB_IMU_ACCEL_RATIO 1.01688015f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
-#define CALIB_IMU_GYRO_BIAS_RADPS 0.00600095885f /* gz at rest, rad/s; sign as read; for programs of your own */
-#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228528269f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
+#define CALIB_IMU_ACCEL_BIAS_X_MPS2 -0.0142302942f /* subtracted from ax, m/s^2 */
+#define CALIB_IMU_ACCEL_BIAS_Y_MPS2 -0.0696896538f /* subtracted from ay, m/s^2 */
+#define CALIB_IMU_ACCEL_RATIO 1.01688147f /* of ay less its bias: (1 + scale of x) / (1 + scale of y) */
+#define CALIB_IMU_GYRO_BIAS_RADPS 0.00600103475f /* gz at rest, rad/s; sign as read; for programs of your own */
+#define CALIB_IMU_MOUNT_ANGLE_RAD 0.0228521246f /* atan2(RATIO ay, ax) at rest at phi = 0, subtracted, rad, -pi to pi */
 #define CALIB_IMU_ACCEL_LIMIT_MPS2 157.0f /* readings beyond are lost, m/s^2 */
 #define CALIB_IMU_RATE_LIMIT_RADPS 35.0f /* readings beyond are lost, rad/s */
 #define CALIB_IMU_ACCEL_WEAK_MPS2 1.0f /* |ax| and |ay| below say nothing of phi, m/s^2 */
@@ -192,13 +192,13 @@
  */
 #define CALIB_MM_KP_DT 0.0500000007f /* Kp dt, dimensionless; Kp = 3 1/s */
 #define CALIB_MM_KI_DT2 0.000833333354f /* Ki dt^2, dimensionless; Ki = 3 1/s^2 */
-#define CALIB_MM_DT_S 0.0163862724f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
-#define CALIB_MM_GYRO_BIAS_DT_RAD 9.83333448e-05f /* bias times the same, rad */
+#define CALIB_MM_DT_S 0.0163862444f /* dt of the rate over the gyroscope's scale, s; phi falls for gz > 0 */
+#define CALIB_MM_GYRO_BIAS_DT_RAD 9.83344289e-05f /* bias times the same, rad */
 #define CALIB_MM_INTEGRAL_LIMIT_RAD 0.0166666675f /* |J| stays below, rad; 1 rad/s */
 #define CALIB_PHI_LIMIT_RAD 1.58000004f /* |phi| stays below; range of the sine in the pipeline, rad */
 
 /* Marker to head (A.1): x = X - d sin(phi), y = Y - d cos(phi). */
-#define CALIB_MARKER_OFFSET_M 0.0145314224f /* d, m; positive beyond the head */
+#define CALIB_MARKER_OFFSET_M 0.0145319803f /* d, m; positive beyond the head */
 
 /*
  * Low-pass of x and y. y_k = b0 x_k + b1 x_(k-1) + b2 x_(k-2) - a1 y_(k-1) - a2 y_(k-2): SciPy's
@@ -220,7 +220,7 @@
  * f = F0 + F1 phi^2 + F2 phi^4 + F3 phi^6; bellows 1 is the longer one for phi > 0.
  */
 #define CALIB_BELLOWS_RADIUS_M 0.0126f /* r_B, m */
-#define CALIB_REST_LENGTH_M 0.06521184f /* l0, m; length until the first picture */
+#define CALIB_REST_LENGTH_M 0.0652115643f /* l0, m; length until the first picture */
 #define CALIB_INVERSE_F0_PER_RAD0 2.0f /* coefficient of phi^0 (3.14), 1/rad^0 */
 #define CALIB_INVERSE_F1_PER_RAD2 0.0833333358f /* coefficient of phi^2 (3.14), 1/rad^2 */
 #define CALIB_INVERSE_F2_PER_RAD4 0.00243055564f /* coefficient of phi^4 (3.14), 1/rad^4 */
@@ -234,21 +234,21 @@
  * Gains for the noise in align.
  */
 #define CALIB_HAS_FUSED 1 /* for #if */
-#define CALIB_FUSED_DELAY_TICKS 1.48377752f /* D, ticks from the exposure of a picture to its tick */
-#define CALIB_FUSED_ACCEL_11 0.000252797414f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_12 5.87567729e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 -4.00745785e-06f /* row 1, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_21 -5.77814126e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_22 0.000257064676f /* row 2, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_2 -1.78377359e-05f /* row 2, of the biases, subtracted, rad */
-#define CALIB_FUSED_ACCEL_GAIN 0.0025044037f /* K_a, share of the accelerometer's residual */
-#define CALIB_FUSED_ACCEL_WEAK 0.000255290885f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
-#define CALIB_FUSED_HALF_DT_S 0.00819313619f /* dt / 2 over the gyroscope's scale, s */
-#define CALIB_FUSED_HALF_BIAS_RAD 4.91666724e-05f /* bias times the same, rad */
-#define CALIB_FUSED_PHI_PER_M 0.374826878f /* K_c / lever, rad/m */
-#define CALIB_FUSED_ALONE_PHI_PER_M 5.30365086f /* the same without the IMU, rad/m */
-#define CALIB_FUSED_BOOST_PHI_PER_M 10.6073017f /* the same after a start, rad/m */
-#define CALIB_FUSED_BIAS 0.00252431189f /* K_b, share of the correction */
+#define CALIB_FUSED_DELAY_TICKS 1.48377895f /* D, ticks from the exposure of a picture to its tick */
+#define CALIB_FUSED_ACCEL_11 0.000252792379f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_12 5.87538716e-06f /* row 1, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_1 -4.00676345e-06f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_21 -5.77784886e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_22 0.000257059874f /* row 2, of ay, rad per m/s^2 */
+#define CALIB_FUSED_ACCEL_2 -1.78321934e-05f /* row 2, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_GAIN 0.00250435318f /* K_a, share of the accelerometer's residual */
+#define CALIB_FUSED_ACCEL_WEAK 0.000255285733f /* |A| and |B| below say nothing of phi, rad; 1 m/s^2 */
+#define CALIB_FUSED_HALF_DT_S 0.00819312222f /* dt / 2 over the gyroscope's scale, s */
+#define CALIB_FUSED_HALF_BIAS_RAD 4.91672145e-05f /* bias times the same, rad */
+#define CALIB_FUSED_PHI_PER_M 0.374827266f /* K_c / lever, rad/m */
+#define CALIB_FUSED_ALONE_PHI_PER_M 5.30360365f /* the same without the IMU, rad/m */
+#define CALIB_FUSED_BOOST_PHI_PER_M 10.6072073f /* the same after a start, rad/m */
+#define CALIB_FUSED_BIAS 0.00252431398f /* K_b, share of the correction */
 #define CALIB_FUSED_MOVING_LENGTH 0.188214049f /* K_m, dimensionless */
 #define CALIB_FUSED_MOVING_RATE 0.00688337162f /* K_v, per tick */
 #define CALIB_FUSED_REST_LENGTH 0.00906918757f /* K_r, dimensionless */
@@ -307,19 +307,19 @@
 #define CALIB_FF_SLOPE_PWM_PER_M 5498.1001f /* PWM/m */
 #define CALIB_FF_MINUS_PWM 258.372711f /* SLOPE FROM less the value there, PWM */
 #define CALIB_FF_LIMIT_PWM 255.0f /* largest value, PWM */
-#define CALIB_FF_TABLE_FROM_M 0.06521184f /* length of the first entry, m */
+#define CALIB_FF_TABLE_FROM_M 0.0652115643f /* length of the first entry, m */
 #define CALIB_FF_TABLE_PER_STEP 500.0f /* entries per metre, 1/m */
 #define CALIB_FF_TABLE_SIZE 15 /* entries */
 /* PWM that holds a bellows at FROM + 0.002 m times the index */
 static const float calib_ff_table_pwm[15] CALIB_IN_FLASH = {
-    99.75f, 128.27211f, 139.781891f, 149.229797f, 157.675949f, 165.598511f,
-    173.253586f, 180.79541f, 188.395203f, 196.218399f, 204.478745f, 213.558975f,
-    224.288864f, 242.163849f, 253.5f,
+    99.75f, 128.272125f, 139.781921f, 149.229828f, 157.675995f, 165.598557f,
+    173.253647f, 180.795486f, 188.395264f, 196.218475f, 204.478836f, 213.559097f,
+    224.289017f, 242.164352f, 253.5f,
 };
 
 /* Envelope, see calib_guard.h: the pumps stop where the actuator leaves it. */
-#define CALIB_ENVELOPE_LEAST_M 0.0452118404f /* shortest length of a bellows, m */
-#define CALIB_ENVELOPE_GREATEST_M 0.115211837f /* longest length of a bellows, m */
+#define CALIB_ENVELOPE_LEAST_M 0.0452115647f /* shortest length of a bellows, m */
+#define CALIB_ENVELOPE_GREATEST_M 0.115211561f /* longest length of a bellows, m */
 #define CALIB_ENVELOPE_ANGLE_RAD 1.5f /* greatest bending to each side, rad */
 #define CALIB_ENVELOPE_STEP_M 0.00833333377f /* greatest change of a length in a tick, m; 0.5 m/s */
 #define CALIB_ENVELOPE_FULL_TICKS 180 /* ticks that a pump may stay at its greatest command */
