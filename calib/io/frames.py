@@ -270,19 +270,23 @@ def opened_video(source: int | str) -> cv2.VideoCapture | None:
 
 
 _MJPEG = cv2.VideoWriter.fourcc(*"MJPG")
+_MOST_DAMAGED = 30
+"""Damaged frames in turn, about a second of them, from which on a stream is lost."""
 
 
 def next_frame(video: cv2.VideoCapture) -> AnyArray | None:
-    """The next whole frame (H, W, 3) of a video that `opened_video` opened; None at the end."""
-    while True:
+    """The next whole frame (H, W, 3) of a video that `opened_video` opened; None where it ends or is lost."""
+    for _ in range(_MOST_DAMAGED):
         there, frame = video.read()
         if not there or frame is None:
             return None
-        if video.get(cv2.CAP_PROP_FORMAT) != -1:
+        # Bytes as they came are one row. The property is no help: DirectShow says -1 for any camera.
+        if len(frame) > 1:
             return frame
         data = frame.tobytes()
         if 0 < declared_pixels(data) <= _MOST_PIXELS and (whole := decode(data, colour=True)) is not None:
             return whole
+    return None
 
 
 def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[Any, Any]]]:
@@ -311,7 +315,8 @@ def timed_frames(source: Path | int | str) -> tuple[Times, Iterator[np.ndarray[A
                 if frame.shape[0] * frame.shape[1] > _MOST_PIXELS:
                     raise BadInputError(f"{name}: frames have over {_MOST_PIXELS // 10**6} million pixels")
                 black = black and not frame.any()
-                stamp = time.monotonic() if times.arrival else 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
+                # The monotonic clock of Windows has steps of 16 ms.
+                stamp = time.perf_counter() if times.arrival else 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 times.stamps_s.append(stamp)
                 yield frame
         finally:

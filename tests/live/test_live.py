@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -38,6 +39,7 @@ from calib.cli.main import main
 from calib.core.arrays import GrayImage
 from calib.core.errors import BadInputError
 from calib.core.geometry import box_grid
+from calib.io.frames import next_frame
 from calib.io.logs import read_log
 from calib.io.serial import Frame, Inputs, Outputs
 from calib.live import server
@@ -515,6 +517,16 @@ def test_a_stream_whose_size_is_switched_has_frames_of_both_sizes(tmp_path: Path
     source.close()
     camera.shutdown()
     camera.server_close()
+
+
+def test_a_stream_of_damaged_frames_alone_ends() -> None:
+    """A frame is told from its bytes whatever the property says: DirectShow says -1 of any camera."""
+    frame = np.zeros((48, 64, 3), np.uint8)
+    sent = cv2.imencode(".jpg", frame)[1][None]
+    for given, whole in ((frame, True), (sent, True), (sent[:, :300], False)):
+        video: Any = SimpleNamespace(read=lambda given=given: (True, given), get=lambda _: -1.0)
+        found = next_frame(video)
+        assert (found is not None and found.shape == frame.shape) if whole else found is None
 
 
 # ----------------------------------------------------------------------
