@@ -1049,11 +1049,12 @@ def _followed(stretch: Stretch, c: FloatArray, fit: Fit) -> Stretch:
 # Barfoot and Sibley 2012). Priors come from outside; where the posterior is no narrower, the logs say
 # nothing.
 #
-# The covariance is that of the fit plus that of biases that have walked by K sqrt(T / 3) in the mean of a
-# log, and of those that in one log are not what they are in the others: of a sensor that was mounted anew or
-# was warmer, of a camera that was moved, or, of the time offset, of a log that was joined to its camera's by
-# itself. To add d to a quantity in one log, which changes its readings by J,
-# has the score g = J' W e and the information I, J' W J less what motion and s explain; d = g / I.
+# The covariance is that of the fit, its information bounded, plus that of biases that have walked by
+# K sqrt(T / 3) in the mean of a log, of a time offset by the jitter of a log's stamps, and of quantities that
+# in one log are not what they are in the others: of a sensor that was mounted anew or was warmer, of a camera
+# that was moved, or, of the time offset, of a log that was joined to its camera's by itself. To add d to a
+# quantity in one log, which changes its readings by J, has the score g = J' W e and the information I,
+# J' W J less what motion and s explain; d = g / I.
 # Nor need gravity lie along the world's y axis, which is a board's. The mount angle is the one against
 # gravity, so that the head's motion comes turned by that angle; across a swinging head it looks like an IMU
 # that sits aside. By the logs the angle is not told well from it, and the covariance holds what is likely. It
@@ -1380,7 +1381,7 @@ that, by .3.
 """
 
 
-def _held_between_logs(problem: Problem, fit: Fit) -> FloatArray:
+def _bounded(problem: Problem, fit: Fit) -> FloatArray:
     """Covariance (14, 14) of the fit, whose information beside the prior's ends at that of `_ALIKE_S`.
 
     Errors are not all noise that longer logs average out: motion follows what a controller has read, sensors
@@ -1569,7 +1570,7 @@ def align(logs: Sequence[AlignLog], settings: Settings) -> Alignment:
         problem = replace(problem, stretches=at_once)
         fit = solve(problem, fit.sensor, fit.noise)
     moved = settings.turn_sigma_rad * turned(problem, fit)
-    covariance = _held_between_logs(problem, fit) + _walked(settings, problem, fit) + np.outer(moved, moved)
+    covariance = _bounded(problem, fit) + _walked(settings, problem, fit) + np.outer(moved, moved)
     covariance += _likely(problem, fit, partial(_turned_motion, fit), _LEAN_RAD)
     covariance += _likely(problem, fit, partial(_skewed, fit), _SKEW)
     # What is left of a delay that was taken out is its deviation.
