@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -484,17 +485,20 @@ def detect_charuco(gray: GrayImage, markers: Markers, layout: Layout) -> Detecti
 # ----------------------------------------------------------------------
 # Grids of circles and grids of markers are recognised, so that they can be named; they are not read.
 
-_CIRCLES, _CIRCLES_PIXELS = "a grid of circles", 300_000
-_FEWEST_CIRCLES, _MOST_CIRCLES = 20, 300
-"""Round spots that form a grid of circles, and of a picture that may show one."""
-_OF_SPOTS = 0.7
-"""Their share of all round spots."""
+_CIRCLES_PIXELS = 300_000
+_CIRCLES = (12, 300)
+"""Round spots of a picture that may show a grid of circles."""
+_FEWEST_OF_PART, _OF_SPOTS = 20, 0.9
+"""Round spots that form one grid, and their share of all, that are a part of a grid of circles."""
+SOME_CIRCLES = "a grid of circles"
 _ROUND = 0.83
 """4 pi area / perimeter^2: of a square pi / 4, of a circle seen at 60 degrees 0.84."""
 _AROUND = 8
 """Nearest spots, of which those on opposite sides are a spot's neighbours in its row and column."""
 _BESIDE = 0.3
 """Distance of a spot from its place over that of its neighbour: perspective takes a tenth of it."""
+_BASES = tuple(np.array(basis) for basis in ([[1, 0], [0, 1]], [[1, 1], [0, 1]], [[1, -1], [0, 1]]))
+"""What two neighbours may be in columns and rows, where slanting ones are the nearer."""
 
 
 def _neighbours(points: FloatArray) -> FloatArray:
@@ -548,21 +552,45 @@ def _like(basis: FloatArray, steps: FloatArray) -> FloatArray:
     return np.where(off[:, None], basis, chosen)
 
 
-def circle_grid(gray: GrayImage) -> bool:
-    """Whether a picture shows a grid of circles, or a part of one."""
+def _sizes(places: IntArray) -> list[tuple[str, int, int]]:
+    """Grids that spots at these coordinates fill: kind, circles in a row, rows."""
+    sizes, count = [], len(np.unique(places, axis=0))
+    for basis in _BASES if count >= _CIRCLES[0] else ():
+        straight = places @ basis
+        columns, rows = sorted(np.ptp(straight, axis=0) + 1, reverse=True)
+        if count == columns * rows:
+            sizes.append(("symmetric", int(columns), int(rows)))
+        across, along = np.ptp(straight @ [[1, 1], [1, -1]], axis=0) + 1
+        for wide, rows in ((across, along), (along, across)):
+            if wide % 2 == 0 and 2 * count == wide * rows:
+                sizes.append(("asymmetric", int(wide // 2), int(rows)))
+    return [(kind, columns, rows) for kind, columns, rows in sizes if min(columns, rows) >= 3]
+
+
+def circle_grid(gray: GrayImage) -> str | None:
+    """What grid of circles a picture shows, in words: with its size, or `SOME_CIRCLES` of a part of one.
+
+    The spots say the size that OpenCV is asked for. To ask for every size took a minute for each picture
+    of gravel.
+    """
     small = _reduced(gray, _CIRCLES_PIXELS)
     parameters = cv2.SimpleBlobDetector.Params()
     parameters.filterByCircularity, parameters.minCircularity = True, _ROUND
     spots = cv2.SimpleBlobDetector.create(parameters)
+    some = False
     for image in (small, cv2.bitwise_not(small)):
         points = np.array([spot.pt for spot in spots.detect(image)]).reshape(-1, 2)
-        if _FEWEST_CIRCLES <= len(points) <= _MOST_CIRCLES:
-            places = _places(points)
-            # Spots that lie anyhow share their places.
-            single = len(np.unique(places, axis=0)) == len(places)
-            if single and len(places) >= max(_FEWEST_CIRCLES, _OF_SPOTS * len(points)):
-                return True
-    return False
+        if not _CIRCLES[0] <= len(points) <= _CIRCLES[1]:
+            continue
+        places = _places(points)
+        # Spots that lie anyhow share their places.
+        single = len(np.unique(places, axis=0)) == len(places)
+        some = some or (single and len(places) >= max(_FEWEST_OF_PART, _OF_SPOTS * len(points)))
+        for kind, columns, rows in _sizes(places):
+            flag = cv2.CALIB_CB_SYMMETRIC_GRID if kind == "symmetric" else cv2.CALIB_CB_ASYMMETRIC_GRID
+            if cv2.findCirclesGrid(image, (columns, rows), flags=flag, blobDetector=spots)[0]:
+                return f"{'an' if kind == 'asymmetric' else 'a'} {kind} grid of circles, {columns}x{rows}"
+    return SOME_CIRCLES if some else None
 
 
 def other_board(gray: GrayImage) -> str | None:
@@ -570,12 +598,17 @@ def other_board(gray: GrayImage) -> str | None:
     layout = recognise([gray])
     if layout is not None:
         return "a ChArUco board" if layout.kind == "charuco" else f"a grid of {layout.dictionary} markers"
-    return _CIRCLES if circle_grid(gray) else None
+    return circle_grid(gray)
 
 
 def name_of(pictures: Sequence[GrayImage]) -> str | None:
     """What most of these pictures show that calib does not read; None where that is nothing known."""
-    if sum(map(circle_grid, pictures)) >= max(1, len(pictures) // 3):
-        return _CIRCLES
-    mirrored = [np.asarray(cv2.flip(gray, 1), dtype=np.uint8) for gray in pictures]
-    return "a board of markers, mirrored: flip the pictures back" if recognise(mirrored) else None
+    counts = Counter(grid for gray in pictures if (grid := circle_grid(gray)))
+    if not counts:
+        mirrored = [np.asarray(cv2.flip(gray, 1), dtype=np.uint8) for gray in pictures]
+        return "a board of markers, mirrored: flip the pictures back" if recognise(mirrored) else None
+    sized = [(many, grid) for grid, many in counts.items() if grid != SOME_CIRCLES]
+    for many, grid in (max(sized, default=(0, "")), (counts.total(), SOME_CIRCLES)):
+        if many >= max(1, len(pictures) // 3):
+            return grid
+    return None
