@@ -701,7 +701,7 @@ def test_a_page_sends_frames_and_what_is_too_large_is_refused(tmp_path: Path) ->
 def test_a_page_that_sleeps_holds_up_no_other(tmp_path: Path) -> None:
     """It takes nothing that it is sent, until it is let go; it may connect again."""
     # As one would be: packed, words that repeat themselves take a few bytes, and all fits into the sockets.
-    with served(tmp_path / "rig") as live, tab(live) as line, tab(live, compression=None):
+    with served(tmp_path / "rig") as live, tab(live) as line, tab(live, compression=None) as asleep:
         wait(lambda: len(live._tabs) == 2)
         for on in 20_000 * (False, True):
             line.send(json.dumps({"do": "auto", "on": on}))
@@ -710,6 +710,8 @@ def test_a_page_that_sleeps_holds_up_no_other(tmp_path: Path) -> None:
             if len(live._tabs) == 1:
                 break
         assert len(live._tabs) == 1
+        # What it has not taken would keep the server's end of it open beyond the server.
+        asleep.socket.close()
         with tab(live) as again:
             heard(again, "state")
             line.send('{"do": "done"}')
