@@ -134,7 +134,7 @@ class Board:
         # As `calib record` names the log of a further start.
         if new := set(self.album.logs.glob(f"{self.path.stem.split('-')[0]}-*.csv")) - self._there:
             self._there |= new
-            self._begin(max(new))
+            self._begin(max(new, key=lambda path: (len(path.name), path.name)))
         with self.path.open("rb") as stream:
             stream.seek(self._read)
             data = stream.read(1 << 20)

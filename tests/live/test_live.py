@@ -928,7 +928,10 @@ def test_of_a_board_that_restarts_its_last_start_is_shown(tmp_path: Path) -> Non
         record.path.with_name(f"{name}.csv").write_text(f"t_s,u_px,v_px\n{rows}")
         told = record.shown()
         assert told["seconds"] == round(shown_s, 1) and len(told["plots"][0]["rows"]) == 2
-    assert record.path.name == "static1-3.csv"
+    for number in (9, 10):
+        record.path.with_name(f"static1-{number}.csv").write_text("t_s,u_px,v_px\n")
+    record.shown()
+    assert record.path.name == "static1-10.csv"
 
 
 def test_the_page_in_a_browser_from_the_start_to_ok(tmp_path: Path) -> None:
