@@ -184,6 +184,8 @@ class Log(InWords):
         if twice.any():
             kept = np.concatenate([[True], ~twice])
             rows, stamps, values = rows[kept], stamps[kept], values[kept]
+        if not set(wanted) & set(IMU):
+            stamps = _stamps_in_bursts(self, rows, stamps)
         findings = (*watch.findings(stuck=False), *([_APART] if apart is not None else []))
         return Signals(log.source, wanted, stamps, values, rows, log.lines[rows], int(twice.sum()), findings)
 
@@ -653,8 +655,26 @@ _APART = Finding(
     "remark",
     "accelerometer and gyroscope have rows of their own; the accelerometer is read on straight lines between",
 )
+_IN_BURSTS = 0.25
+"""Share of samples that bear the stamp of the one before."""
 _FAR_APART = 5.0
 """Steps of the accelerometer from which on what lies between is not known."""
+
+
+def _stamps_in_bursts(log: Log, rows: IntArray, stamps_s: FloatArray) -> FloatArray:
+    """Stamps of rows (n,), of those that hold an IMU sample too its time, where these come in bursts.
+
+    All rows of a burst bear the stamp of the last one, a picture among them like the sample beside it.
+    """
+    felt = log.sampled(*(name for name in IMU if name in log.columns), partly=True)
+    beside = np.isin(rows, felt, assume_unique=True)
+    if not beside.any() or float(np.mean(np.diff(log.t_s[felt]) == 0.0)) < _IN_BURSTS:
+        return stamps_s
+    axis = time_axis(log.t_s[felt])
+    if axis.burst == 1:
+        return stamps_s
+    times = np.where(beside, axis.t_s[np.searchsorted(felt, rows).clip(max=len(felt) - 1)], stamps_s)
+    return np.asarray(np.maximum.accumulate(times))
 
 
 def _accel_at_gyro_times(log: Log, names: Sequence[str]) -> Log | None:

@@ -83,6 +83,15 @@ def test_alike_pictures_of_a_burst_are_readings_of_their_own() -> None:
     assert (len(signals), signals.repeated_rows) == (1500, 0)
 
 
+def test_a_picture_in_a_row_of_a_burst_was_taken_with_its_sample() -> None:
+    """Five samples at a time, all with the stamp of the last one; every third has a picture."""
+    taken = 0.01 * np.arange(3000)
+    picture = np.arange(3000) % 3 == 1
+    log = _log(u_px=np.where(picture, 100.0 + np.sin(taken), np.nan))
+    log = replace(log, t_s=taken[np.arange(3000) // 5 * 5 + 4] + 0.003)
+    assert np.abs(log.signals("u_px").t_s - taken[picture] - 0.003).max() < 1e-4
+
+
 @pytest.mark.parametrize(
     ("changes", "severity", "words"),
     [
