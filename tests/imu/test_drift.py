@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from armlogs import swung
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from calib.io.logs import Log
 from calib.solve.clock import Part
@@ -209,6 +210,23 @@ def test_lag_to_a_fraction_of_a_sample(lag: float) -> None:
     assert lag_s([noisy[:2500], noisy[2500:]], [angle(t[:2500]), angle(t[2500:])], 0.01) == pytest.approx(
         lag, abs=5e-4
     )
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.05])
+def test_a_truth_is_placed_in_time_when_the_sensor_tilts(late_s: float) -> None:
+    """There -gz is not the rate of the angle, and a truth in time seemed 8 ms early."""
+    t = PERIOD * np.arange(3000)
+    about_x, about_z = 0.6 * np.sin(2.0 * t) + 0.3, 0.5 * np.sin(2.6 * t) + 0.3 * np.sin(4.1 * t)
+    turns = Rotation.from_euler("XYZ", np.stack([about_x, 0.4 * np.sin(1.7 * t), about_z], axis=1))
+    up = turns.inv().apply([0.0, 1.0, 0.0])
+    between = (turns[:-1].inv() * turns[1:]).as_rotvec() / PERIOD
+    gyro = 0.5 * (np.vstack([between[:1], between]) + np.vstack([between, between[-1:]]))
+    log = Readings("log.csv", AXES, t, np.concatenate([gyro, 9.80665 * up], axis=1))
+    truth = np.unwrap(np.arctan2(up[:, 1], up[:, 0]))
+    found = analyse_drift(replace(log, true_t_s=t + late_s, true_phi_rad=truth), peers=False).section
+    lag_ms = found.methods["levelling in three axes"].lag_ms
+    assert lag_ms is not None and abs(lag_ms) < 1.0
+    assert bool(found.remarks) == bool(late_s)
 
 
 def _log_tracks(

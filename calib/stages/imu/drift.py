@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
 
-from calib.core.arrays import BoolArray, FloatArray, blocks, runs
+from calib.core.arrays import BoolArray, FloatArray, blocks, integral, runs
 from calib.core.errors import BadInputError
 from calib.core.result import degrees_or_none, finite_or_none, judged
 from calib.core.verdict import Finding, Verdict
@@ -22,6 +22,7 @@ from calib.solve.delay import vertex
 from calib.stages.imu.allan import allan_variance
 from calib.stages.imu.mahony import Mahony, mean_angle, wrapped
 from calib.stages.imu.sampling import (
+    AXES,
     Readings,
     Sampling,
     over_logs,
@@ -33,7 +34,7 @@ from calib.stages.imu.sampling import (
     without_gaps,
 )
 from calib.stages.imu.section import Drift, DriftGains, DriftMethod, DriftOfLog, DriftSlopes
-from calib.stages.imu.tracks import Track, Tuned, on_grid, rate_of, tracks_of
+from calib.stages.imu.tracks import Track, Tuned, levelled_angle, on_grid, rate_of, tracks_of
 from calib.stages.imu.tuning import contradicted, parameters_of
 
 # ----------------------------------------------------------------------
@@ -61,7 +62,7 @@ from calib.stages.imu.tuning import contradicted, parameters_of
 # **Lag.** Both angles are freed from what is slower than some seconds, the estimate is moved against the
 # truth by whole samples, and a parabola through the highest correlation and its neighbours gives the
 # fraction. Drift and offsets so play no part. An instrument's truth may itself come late: by how much the
-# rate integrated, which is half a step ahead, leads it says so, and the truth is moved by that first.
+# angle by the gyroscope leads it says so, and the truth is moved by that first.
 
 _BLOCKS = 128
 _FEWEST_BLOCKS = 8
@@ -173,26 +174,11 @@ def _quick(y: FloatArray, period_s: float) -> FloatArray:
     return np.asarray(y - uniform_filter1d(y, size, mode="nearest"))[end : len(y) - end]
 
 
-def lag_s(
-    estimate: Sequence[FloatArray],
-    truth: Sequence[FloatArray],
-    period_s: float,
-    farthest_s: float = _FARTHEST_S,
-    least: float = _LEAST_CORRELATION,
-) -> float:
-    """How much later [s] the estimate comes than the truth; negative where it is ahead.
-
-    Parameters
-    ----------
-    estimate, truth : pairs of stretches (n_i,) at one period.
-    farthest_s : lags that are tried, on both sides.
-    least : correlation below which the two hardly resemble each other.
-
-    Returns
-    -------
-    NaN where the two hardly resemble each other, or are most alike at the end of what was tried.
-    """
-    M = max(round(farthest_s / period_s), 2)
+def _likest(
+    estimate: Sequence[FloatArray], truth: Sequence[FloatArray], period_s: float
+) -> tuple[float, float]:
+    """Highest correlation over all lags, and the lag there; -1 and NaN where none is or it is at an end."""
+    M = max(round(_FARTHEST_S / period_s), 2)
     lags = np.arange(-M, M + 1)
     both, own, theirs = np.zeros(len(lags)), np.zeros(len(lags)), 0.0
     for e, t in zip(estimate, truth, strict=True):
@@ -208,25 +194,52 @@ def lag_s(
             both[i] += float(moved @ quick_t)
             own[i] += float(moved @ moved)
     if not (theirs > 0.0 and own.min() > 0.0):
-        return math.nan
+        return -1.0, math.nan
     c = both / np.sqrt(own * theirs)
     i = int(np.argmax(c))
-    if i in (0, len(c) - 1) or c[i] < least:
-        return math.nan
-    return float((lags[i] + vertex(*(-c[i - 1 : i + 2]).tolist())) * period_s)
+    if i in (0, len(c) - 1):
+        return -1.0, math.nan
+    return float(c[i]), float((lags[i] + vertex(*(-c[i - 1 : i + 2]).tolist())) * period_s)
+
+
+def lag_s(estimate: Sequence[FloatArray], truth: Sequence[FloatArray], period_s: float) -> float:
+    """How much later [s] the estimate comes than the truth; negative where it is ahead.
+
+    Parameters
+    ----------
+    estimate, truth : pairs of stretches (n_i,) at one period.
+
+    Returns
+    -------
+    NaN where the two hardly resemble each other, or are most alike at the end of what was tried.
+    """
+    likeness, lag = _likest(estimate, truth, period_s)
+    return lag if likeness >= _LEAST_CORRELATION else math.nan
+
+
+def turned_angles(parts: Sequence[Part], axes: tuple[str, ...]) -> list[list[FloatArray]]:
+    """Angles (n_i,) [rad] of each part to place a truth by: -gz integrated, and levelled by six axes.
+
+    Of a sensor that tilts -gz is not the angle's rate, and seems ten milliseconds early or late.
+    """
+    ways = [[integral(part.t_s, rate_of(part, axes, False)) for part in parts]]
+    if len(axes) == len(AXES):
+        ways.append([levelled_angle(part, axes) for part in parts])
+    return ways
 
 
 def truth_late_s(
-    turned: Sequence[FloatArray], truth: Sequence[FloatArray], period_s: float, turned_late_s: float = 0.0
+    turned: Sequence[Sequence[FloatArray]], truth: Sequence[FloatArray], period_s: float
 ) -> float:
     """How much later [s] a truth comes than the gyroscope turned; 0 where that is not clear or negligible.
 
     Parameters
     ----------
-    turned, truth : angles (n_i,) [rad] of each part, NaN where not known.
-    turned_late_s : by how much the integrated angles come late themselves.
+    turned : as of `turned_angles`; the one that resembles the truth most counts.
+    truth : angles (n_i,) [rad] of each part, NaN where not known.
     """
-    late_s = turned_late_s - lag_s(*_both_known(turned, truth), period_s, least=_SURE_CORRELATION)
+    likeness, lag = max(_likest(*_both_known(angles, truth), period_s) for angles in turned)
+    late_s = -lag if likeness >= _SURE_CORRELATION else 0.0
     return late_s if abs(late_s) > _LEAST_LATE * period_s else 0.0
 
 
@@ -404,7 +417,7 @@ def analyse_drift(
     truth, late_s = None, 0.0
     if len(log.true_t_s) >= 2:
         truth = on_grid(log.true_t_s, log.true_phi_rad, parts, period_s)
-        late_s = truth_late_s(by_name["gyroscope alone"], truth, period_s, -0.5 * period_s)
+        late_s = truth_late_s(turned_angles(parts, log.axes), truth, period_s)
         if late_s:
             truth = on_grid(log.true_t_s - late_s, log.true_phi_rad, parts, period_s)
         stretches = [(k, _settled(0, len(part.values), period_s)) for k, part in enumerate(parts)]

@@ -23,7 +23,7 @@ from calib.io.columns import ACCEL, GYRO, IMU, IN_PLANE
 from calib.io.logs import Log, Signals, log_from_cells
 from calib.solve.clock import Part, time_axis
 from calib.solve.delay import estimate_delay
-from calib.stages.imu.drift import truth_late_s
+from calib.stages.imu.drift import truth_late_s, turned_angles
 from calib.stages.imu.levelling import GAP_S
 from calib.stages.imu.sampling import (
     AXES,
@@ -254,7 +254,7 @@ def tune_log(log: Log, how: Reading) -> TuneLog:
     rates = [rate_of(part, read.axes, how.tilted) for part in kept]
     if named:
         if named == "truth":
-            turned = [integral(part.t_s, rate) for part, rate in zip(kept, rates, strict=True)]
+            turned = turned_angles(kept, read.axes)
             lag = truth_late_s(turned, on_grid(late_t_s, phi, kept, period), period)
         else:
             lag = _lag(late_t_s, phi, kept, rates, read.axes, period)

@@ -200,6 +200,12 @@ def _turning(up: FloatArray) -> FloatArray:
     return np.unwrap(np.arctan2(up[:, 1], up[:, 0]))
 
 
+def levelled_angle(part: Part, axes: tuple[str, ...]) -> FloatArray:
+    """Angle (n,) of the up vector by the levelling filter, of a part that has all six axes."""
+    gyro, force = three(part, axes)
+    return _turning(level_three(Levelling(), part.t_s, force, gyro))
+
+
 def tracks_of(
     log: Readings,
     parts: Sequence[Part],
@@ -239,10 +245,6 @@ def tracks_of(
 
         return angle
 
-    def levelled(part: Part) -> FloatArray:
-        gyro, force = three(part, axes)
-        return _turning(level_three(Levelling(), part.t_s, force, gyro))
-
     if len(log.onchip_t_s) >= 2:
         found.append(Track("on the chip", on_grid(log.onchip_t_s, log.onchip_phi_rad, parts, period_s)))
     else:
@@ -265,7 +267,7 @@ def tracks_of(
         )
         return found, skipped
     add("MM 3/3 with up vector", filtered(mahony.Mahony(), tilted=True))
-    add("levelling in three axes", levelled)
+    add("levelling in three axes", lambda part: levelled_angle(part, axes))
     samples = sum(len(part.values) for part in parts)
     for name in PEERS if peers else ():
         if package := missing(name):
