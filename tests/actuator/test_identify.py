@@ -29,6 +29,7 @@ from calib.stages.actuator.identify import (
     _left,
     _spread,
     _whole,
+    _without_creep,
     colour_of,
     first_guess,
     fit_tracks,
@@ -354,6 +355,16 @@ def test_a_creep_that_is_not_there_is_left_at_none(tmp_path: Path) -> None:
         sigma = uncertainty(found).sigma
         for name in ("stiffness_scale", "damping_scale_free_swing", "bending_N_per_rad2", "rest_length_m"):
             assert abs(found.values[name] - truth[name]) < 3.0 * sigma[name], name
+
+
+def test_a_creep_that_noise_makes_is_left_at_none() -> None:
+    names = ("stiffness_scale", "damping_scale_pumps_connected", "lambda1_per_s", "lambda2_N_per_m")
+    problem = Problem(Machine(), [track("steps", {"lambda2_N_per_m": 0.0}, seed=1)], names, {})
+    start = {**values_of(Machine()), "lambda1_per_s": 5.0, "lambda2_N_per_m": 0.1}
+    x, cost, residual, J = solve(problem, first_guess(problem, start))
+    noisy = Solution(problem, x, residual, J, cost, {}, 1, 1)
+    assert noisy.values["lambda2_N_per_m"] == pytest.approx(0.9, abs=0.1)
+    assert "no creep" in _without_creep(noisy).fixed["lambda2_N_per_m"]
 
 
 def test_a_log_held_back_is_predicted_as_well_as_fitted(solution: Solution) -> None:

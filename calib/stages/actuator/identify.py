@@ -1044,10 +1044,14 @@ def _without_creep(solution: Solution) -> Solution:
     """The solution, or where its creep is doubtful that with the usual one or, if logs contradict it, none.
 
     A rig without creep leaves its rate open: it runs to a bound, where creep is a damper, or is left out, and
-    what stays of the creep bends stiffness and damping.
+    what stays of the creep bends stiffness and damping. Or rate and spring come out as noise has them.
     """
     problem, rate, spring = solution.problem, "lambda1_per_s", "lambda2_N_per_m"
     doubtful = {rate, spring} & {*solution.fixed} or any(label_of(rate) in one for one in at_bounds(solution))
+    if spring in problem.names:
+        k = problem.names.index(spring)
+        sigma = robust_sigma(solution.residual) * math.sqrt(solution.inverse[k, k])
+        doubtful = doubtful or solution.x[k] < _CONTRARY * sigma
     if not doubtful or {*CREEP} & {*problem.stated}:
         return solution
     known = values_of(problem.nominal)

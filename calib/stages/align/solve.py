@@ -1865,8 +1865,8 @@ def _known(found: Alignment) -> Iterator[Finding]:
     if found.rest_angle_sigma > _REST_RAD:
         yield Finding(
             "poor",
-            f"the angle read at rest is known to {math.degrees(found.rest_angle_sigma):.2g} degrees, "
-            "expected 0.1 degrees",
+            f"the angle read at rest is known to {math.degrees(found.rest_angle_sigma):.3g} degrees, "
+            "expected at most 0.1 degrees",
         )
     for k, name in enumerate(SENSOR):
         away = abs(found.sensor[k] - found.mean[k]) / found.prior[k]
