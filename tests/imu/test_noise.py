@@ -435,18 +435,48 @@ def test_what_a_short_log_cannot_show_gets_a_bound() -> None:
     assert held >= 36
 
 
-def test_flicker_noise_is_taken_for_bias_instability() -> None:
+def _flicker(n: int, seed: int) -> np.ndarray:
+    """Noise of B = 1, which began long before."""
     # White noise of variance 1 at the period tau0 has the two-sided density tau0. Filtered by
     # (1 - 1/z)^(-1/2) it has 1 / (2 pi f) at low frequencies, which is B^2 / (2 pi f) with B = 1.
-    B, n, rng = 2e-3, 60_000, np.random.default_rng(5)
-    k = np.arange(1, n)
-    kernel = np.concatenate([[1.0], np.cumprod((k - 0.5) / k)])
-    size = 1 << 17
-    white = rng.normal(size=n)
-    flicker = np.fft.irfft(np.fft.rfft(kernel, size) * np.fft.rfft(white, size), size)[:n]
-    found = analyse([B * flicker + 1e-3 * np.sqrt(RATE_HZ) * rng.normal(size=n)], 1.0 / RATE_HZ)
+    f = np.arange(1, 2 * n + 1) / (4.0 * n)
+    spectrum = np.fft.rfft(np.random.default_rng(seed).normal(size=4 * n))[1:] / np.sqrt(
+        2.0 * np.sin(np.pi * f)
+    )
+    return np.fft.irfft(np.concatenate([[0.0], spectrum]), 4 * n)[:n]
+
+
+def test_flicker_noise_is_taken_for_bias_instability() -> None:
+    B = 2e-3
+    found = analyse([B * _flicker(60_000, 5) + _readings(60_000, 1e-3, 0.0, 5)], 1.0 / RATE_HZ)
     assert found.B.supported
     assert found.B.value == pytest.approx(B, rel=0.2)
+
+
+def test_flicker_noise_is_no_random_walk() -> None:
+    """White noise is as large as the flicker at 10 s; the log lasts 600 s."""
+    B, made_up, held = math.sqrt(0.1 / (2.0 * math.log(2.0) / math.pi)), 0, 0
+    for seed in range(40):
+        white = math.sqrt(10.0) * np.random.default_rng(seed).normal(size=6000)
+        found = analyse([white + B * _flicker(6000, 100 + seed)], 0.1)
+        made_up += found.K.supported
+        held += found.B.below > B if not found.B.supported else _within(found.B, B)
+        assert found.B.supported or not found.told_apart
+    assert made_up <= 1
+    assert held >= 36
+
+
+def test_a_random_walk_beside_flicker_noise_lies_in_its_interval() -> None:
+    """White noise is as large as each at 100 s; the log lasts two hours."""
+    B, K, z = 0.1 / math.sqrt(2.0 * math.log(2.0) / math.pi), math.sqrt(3.0) / 100.0, []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        white, walk = rng.normal(size=(2, 7200))
+        found = analyse([white + K * np.cumsum(walk) + B * _flicker(7200, 100 + seed)], 1.0)
+        if found.K.supported:
+            z.append(math.log(found.K.value / K) * found.K.value / found.K.sigma)
+    assert len(z) >= 16
+    assert math.sqrt(np.mean(np.square(z))) < 1.5
 
 
 GYRO = np.array([True, False])

@@ -185,7 +185,11 @@ def bounds(variance: FloatArray, freedom: FloatArray) -> tuple[FloatArray, Float
 #
 # - which terms there are. White noise is always there. B and K are added one at a time, the one with the
 #   larger z = theta / sigma first, and only where z exceeds `LEAST_Z` with the covariance that holds
-#   without the term. Otherwise the log is too short to support it, and it gets an upper bound;
+#   without the term. These fewest terms explain the variances, and N is theirs;
+# - whether what is slow is B or K. One that is fitted without the other takes up what is of that: K came out
+#   up to hundreds of times too large. So the log shows one of them where its z beside both other terms
+#   exceeds `LEAST_Z`, and gives the value and the deviation of all three. Otherwise it is too short to tell,
+#   and bounds the one by what it is where the other is not there;
 # - where the fit begins. Filters in the sensor and coarse steps change the variance at the shortest times.
 #   While the fit is worse than chance would have it once in ten thousand, the shortest time is left out, and
 #   then two octaves more: what is too little to be seen of noise that a filter has coloured shifted N by 4 to
@@ -226,8 +230,8 @@ class Allan:
     ----------
     tau_s, deviation, low, high : (j,) averaging times, deviation, 1-sigma bounds.
     N, B, K : coefficients in unit/sqrt(Hz), unit, unit sqrt(Hz); 1/sqrt(Hz) is sqrt(s).
-    theta : (3,) squares of the supported ones, zero for the others.
-    walk_within : K^2 that the log cannot exclude, one sigma above its estimate, or K^2 if supported.
+    theta : (3,) squares of the fewest that explain the deviation, zero for the others.
+    walk_within : K^2 of theta, or, where it has none, one sigma above what the log allows.
     fit_s : shortest and longest averaging time of the fit.
     chance : probability of residuals at least as large, were the model right.
     """
@@ -243,6 +247,11 @@ class Allan:
     walk_within: float
     fit_s: tuple[float, float]
     chance: float
+
+    @property
+    def told_apart(self) -> bool:
+        """Whether what is slow in the noise, if anything is, is known to be B or K."""
+        return (self.B.supported or not self.theta[1]) and (self.K.supported or not self.theta[2])
 
 
 @dataclass(frozen=True)
@@ -330,30 +339,35 @@ def _select(variance: FloatArray, m: IntArray, G: FloatArray) -> _Fit:
     return _Fit(theta, covariance, active, _chance(variance, D, C, theta, int(active.sum())))
 
 
-def _term(fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray, unit: float) -> Term:
-    square = float(fit.theta[k])
-    if fit.active[k] and square > 0.0:
-        value = math.sqrt(square)
-        sigma = 0.5 * math.sqrt(float(fit.covariance[k, k])) / value
-        return Term(True, unit * value, unit * sigma, math.nan)
-    below = _unsupported(fit, k, variance, D, G, _ONE_SIDED_95)
-    return Term(False, math.nan, math.nan, unit * math.sqrt(below))
+def _shown(theta: FloatArray, covariance: FloatArray, k: int, unit: float) -> Term:
+    value = math.sqrt(float(theta[k]))
+    return Term(True, unit * value, unit * 0.5 * math.sqrt(float(covariance[k, k])) / value, math.nan)
 
 
-def _unsupported(
-    fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray, times_sigma: float
-) -> float:
-    """Upper bound of the square of a term that was not taken up.
+_ALL = np.full(3, True)
 
-    B and K are hard to tell apart, so the bound is the larger one of those with the other and without.
-    """
+
+def _slow_term(fit: _Fit, k: int, variance: FloatArray, D: FloatArray, G: FloatArray, unit: float) -> Term:
+    """B or K, by its number."""
+    without, alone = _ALL.copy(), _ALL.copy()
+    without[k] = alone[3 - k] = False
+    C = _settle(variance, D, G, without, np.where(without, fit.theta, 0.0))[2]
+    estimate, spread = _least_squares(variance, D, C, _ALL)
+    theta, covariance, _ = _settle(variance, D, G, _ALL, fit.theta)
+    if theta[k] > 0.0 and float(estimate[k]) > LEAST_Z * math.sqrt(float(spread[k, k])):
+        return _shown(theta, covariance, k, unit)
+    theta, covariance, _ = _settle(variance, D, G, alone, np.where(alone, fit.theta, 0.0))
+    most = float(theta[k]) + _ONE_SIDED_95 * math.sqrt(float(covariance[k, k]))
+    return Term(False, math.nan, math.nan, unit * math.sqrt(most))
+
+
+def _walk_within(fit: _Fit, variance: FloatArray, D: FloatArray, G: FloatArray) -> float:
+    """K^2 one sigma above its estimate, the larger one of those with B and without."""
     C = _covariance(G, fit.theta)
     found = []
     for others in (fit.active, np.array([True, False, False])):
-        wider = others.copy()
-        wider[k] = True
-        estimate, covariance = _least_squares(variance, D, C, wider)
-        found.append(max(float(estimate[k]), 0.0) + times_sigma * math.sqrt(float(covariance[k, k])))
+        estimate, covariance = _least_squares(variance, D, C, others | np.array([False, False, True]))
+        found.append(max(float(estimate[2]), 0.0) + math.sqrt(float(covariance[2, 2])))
     return max(found)
 
 
@@ -394,10 +408,9 @@ def analyse(parts: Sequence[FloatArray], period_s: float) -> Allan:
     used = (variance[first:], design(m_fit[first:].astype(np.float64)), G[first:, first:])
     root = math.sqrt(period_s)
     units = (root, 1.0, 1.0 / root)
-    terms = [_term(fit, k, *used, units[k]) for k in range(len(KINDS))]
-    walk = float(fit.theta[2])
-    if not terms[2].supported:
-        walk = _unsupported(fit, 2, *used, 1.0)
+    terms = [_shown(fit.theta, fit.covariance, 0, units[0])]
+    terms += [_slow_term(fit, k, *used, units[k]) for k in (1, 2)]
+    walk = float(fit.theta[2]) or _walk_within(fit, *used)
     everywhere = allan_variance(parts, m_all)
     low, high = bounds(everywhere, degrees_of_freedom(m_all, lengths, fit.theta))
     return Allan(

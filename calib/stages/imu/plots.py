@@ -77,7 +77,7 @@ def _deviation(noise: AxisNoise) -> plot.Plot:
     words = []
     terms = (("N", a.N, "blue"), ("B", a.B, "green"), ("K", a.K, "red"))
     for k, ((name, term, hue), unit) in enumerate(zip(terms, _UNITS[noise.axis[0]], strict=True)):
-        if a.theta[k] > 0.0:
+        if term.supported and a.theta[k] > 0.0:
             marks.append(plot.Curve(a.tau_s, parts[:, k], name, "dashed", hue, 1.1))
         bound = f"< {plot.number(term.below, unit, 2)}"
         words.append(f"{name} {plot.number(term.value, unit) if term.supported else bound}")

@@ -485,14 +485,20 @@ def _of_length(result: Static) -> Iterator[Finding]:
             "poor",
             f"{longest:.3g} s at rest are too short to tell a bias from noise, expected {_LEAST_REST_S:g} s",
         )
-    unsupported = [n.axis for n in result.noise if n.allan is not None and not n.allan.K.supported]
-    if unsupported:
-        longer = "a log of several hours at rest would show the random walk of the bias"
-        yield Finding(
-            "remark",
-            f"{longest:.4g} s do not show a random walk of {', '.join(unsupported)}; an upper bound is given",
-            advice="" if longest > _LONG_S else longer,
+    found = {one.axis: one.allan for one in result.noise if one.allan is not None}
+    either = [axis for axis, allan in found.items() if not allan.told_apart]
+    unshown = [axis for axis, allan in found.items() if not allan.K.supported and axis not in either]
+    longer = (
+        "" if longest > _LONG_S else "a log of several hours at rest would show the random walk of the bias"
+    )
+    if either:
+        text = (
+            f"{longest:.4g} s do not tell whether the slow noise of {', '.join(either)} is bias instability "
         )
+        yield Finding("remark", f"{text}or a random walk; upper bounds are given", longer)
+    if unshown:
+        text = f"{longest:.4g} s do not show a random walk of {', '.join(unshown)}; an upper bound is given"
+        yield Finding("remark", text, longer)
 
 
 def judge(result: Static) -> Verdict:
