@@ -351,6 +351,18 @@ def test_poses_in_the_plane_give_the_same_trial(zero_rad: float) -> None:
     np.testing.assert_allclose(again.chord_m, trial.chord_m[: len(again.chord_m)], atol=2e-4)
 
 
+@pytest.mark.parametrize("planar", [False, True])
+def test_an_arm_that_rolls_up_most_of_a_turn_is_read_whole(planar: bool) -> None:
+    """One that is at rest for most of a log, so that the mean is far from the middle of the range."""
+    trial = simulated("a", 1)
+    since = trial.t_s % 20.0
+    bent = np.where(since < 15.0, 0.0, np.sin(np.pi * (since - 15.0) / 5.0) ** 2)
+    trial = replace(trial, command=bent, pressure_kpa=200.0 * bent, angle_rad=4.5 * bent)
+    recording = read_recording(_log(columns_of(trial, planar=planar), trial), "a")
+    again = resample_trial(recording, fit_frame([recording]), "a", 0.0)
+    np.testing.assert_allclose(again.angle_rad, trial.angle_rad[: len(again.angle_rad)], atol=2e-3)
+
+
 def test_frozen_channels_and_jumps_are_findings() -> None:
     trial = simulated("a", 1)
     columns = columns_of(trial)
@@ -399,6 +411,20 @@ def test_a_signal_that_freezes_while_others_move_is_told(column: str, least_s: f
             columns[name] = columns[name].copy()
             columns[name][rows] = columns[name][500]
     assert words in _findings(columns, trial)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_pressure_that_rests_in_the_dead_zone_of_its_pump_is_sound(share: float) -> None:
+    """Or at the end of the supply; one that rests over the whole range of the command is frozen."""
+    trial = simulated("a", 1)
+    ramp = 1.0 - np.abs(1.0 - trial.t_s % 20.0 / 10.0)
+    pressure = np.clip((ramp - 0.4) / 0.6, 0.0, 1.0) if share == 0.0 else np.minimum(ramp, 0.6)
+    pressure = np.round(100.0 * pressure, 1)
+    angle = 0.005 * pressure + 1e-6 * trial.pressure_kpa
+    rests = replace(trial, command=200.0 * ramp, pressure_kpa=pressure, angle_rad=angle)
+    assert "stands still" not in _findings(columns_of(rests), rests)
+    still = np.where((trial.t_s > 20.0) & (trial.t_s < 30.0), share * 60.0, pressure)
+    assert "pressure stands still" in _findings(columns_of(replace(rests, pressure_kpa=still)), rests)
 
 
 @pytest.mark.parametrize(("falls_s", "frozen"), [(10.0, False), (25.0, True)])

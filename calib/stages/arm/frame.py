@@ -175,11 +175,14 @@ def _circular_mean(angles_rad: FloatArray) -> float:
 
 
 def _continuous(angles_rad: FloatArray, zero_rad: float = 0.0) -> FloatArray:
-    """Angles (n,) from a zero, within half a turn of their mean, the first ones within half a turn of 0."""
-    if not np.isfinite(angles_rad).any():
+    """Angles (n,) from a zero, on one turn that is cut where most of it is empty, the first ones near 0."""
+    on_turn = np.remainder(angles_rad[np.isfinite(angles_rad)], math.tau)
+    if not len(on_turn):
         return angles_rad
-    mean = _circular_mean(angles_rad)
-    out = mean - zero_rad + np.remainder(angles_rad - mean + math.pi, math.tau) - math.pi
+    around = np.sort(on_turn)
+    empty = np.diff(around, append=around[0] + math.tau)
+    cut = float(around[np.argmax(empty)] + 0.5 * empty.max())
+    out = cut - zero_rad + np.remainder(angles_rad - cut, math.tau)
     return np.asarray(out - math.tau * round(_initial_angle(out) / math.tau))
 
 

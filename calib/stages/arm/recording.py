@@ -37,6 +37,8 @@ _STILL, _MOVES = 1e-9, 0.2
 _FROZEN_S = {"pressure": 1.0, "pose": 1.0, "command": 10.0}
 """A signal that keeps its value to the digit for so long, while what it follows goes through this share of
 its range, is frozen; a command may be held, while what it drives settles."""
+_BARRED = 0.5
+"""Of the command's range, that a pump's dead zone or one past the supply may take: there a pressure rests."""
 _UNKNOWN_S = 1.0
 """A gap over which nobody knows the command or the pressure."""
 _LEAST_SHARE = 0.1
@@ -319,7 +321,9 @@ def _frozen_signals(recording: Recording) -> Iterator[Finding]:
             # What moved before the signal stood still may still arrive.
             rows = slice(int(np.searchsorted(t, t[first] + 0.5 * least_s)), last + 1)
             moves = _unsettled_range if name == "command" else span
-            moved = [other for other in others if moves(there[other][rows]) > _MOVES * span(there[other])]
+            barred = name == "pressure" and values[first] in (np.nanmin(values), np.nanmax(values))
+            least = _BARRED if barred else _MOVES
+            moved = [other for other in others if moves(there[other][rows]) > least * span(there[other])]
             if moved:
                 yield Finding(
                     "poor",
