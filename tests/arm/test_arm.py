@@ -48,7 +48,7 @@ from calib.stages.arm.model import (
     segment_run,
 )
 from calib.stages.arm.recording import read_recording
-from calib.stages.arm.stage import _outlying_trials
+from calib.stages.arm.stage import _beside_black_boxes, _outlying_trials
 
 
 @pytest.fixture(scope="module")
@@ -216,6 +216,28 @@ def test_a_trial_apart_is_poor_where_it_matters(error_deg: float, severity: str)
     (finding,) = _outlying_trials(found)
     assert finding.severity == severity
     assert finding.text.startswith(f"a is predicted to {error_deg:.1f} deg from the others")
+
+
+@pytest.mark.parametrize(
+    ("errors_deg", "severity"),
+    [((6.6, 3.8, 0.7), "remark"), ((5.3, 5.0, 5.6), "poor"), ((1.0, 1.1, 0.9), "remark")],
+)
+def test_a_black_box_that_is_better_by_chance_is_no_fault(
+    errors_deg: tuple[float, ...], severity: str
+) -> None:
+    """One trial of three is predicted far worse, another far better; or all of them worse."""
+    deg = math.radians(1.0)
+    held = {
+        name: {"angle_by_pressure_rad": x * deg, "angle_rad": math.nan, "chord_m": math.nan}
+        for name, x in zip("abc", errors_deg, strict=True)
+    }
+    box = {
+        name: held["a"] | {"angle_by_pressure_rad": x * deg}
+        for name, x in zip("abc", (3.3, 2.9, 3.5), strict=True)
+    }
+    found = SimpleNamespace(held=held, others={"ARX 8 at 10 Hz": box}, fit=SimpleNamespace(scale=SCALE))
+    (finding,) = _beside_black_boxes(found)
+    assert finding.severity == severity
 
 
 def test_an_arm_is_a_kind_of_actuator_in_the_file() -> None:
@@ -542,6 +564,30 @@ def test_an_arm_that_first_takes_up_slack_has_a_toe() -> None:
     assert "toe" in found.fit.assembly.parts
     without = mean_error(found.others["without toe"], "angle_by_pressure_rad")
     assert mean_error(found.held, "angle_by_pressure_rad") < 0.8 * without
+
+
+def test_a_chamber_lengthens_the_chord_with_its_pressure_before_the_arm_bends() -> None:
+    start = simulated("a", 1)
+    one = replace(start, pressure_kpa=np.zeros(len(start.t_s)))
+    off = FULL.without("settling", "load").values(np.zeros(len(PARAMETERS)), SCALE)
+    p = np.full(len(one.t_s), 100.0)
+    p[0] = 0.0
+    (angle, chord), (same, longer) = (
+        segment_run(one, off | {"extends_m_per_kpa": extends}, p) for extends in (0.0, 1e-4)
+    )
+    np.testing.assert_allclose(same, angle)
+    expected = 1e-2 * (1.0 - np.exp(-one.t_s / off["fill_s"]))
+    np.testing.assert_allclose((longer - chord)[1:], expected[:-1], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_arm_that_its_pressure_lengthens_has_an_extension() -> None:
+    """5 % of the chord at the greatest pressure, as of an arm of plain silicone."""
+    extends = 0.05 * SCALE.chord_m / SCALE.pressure_kpa
+    values = FULL.without("load").values(np.zeros(len(PARAMETERS)), SCALE) | {"extends_m_per_kpa": extends}
+    found = identify([simulated(f"a_{k}", k, values=values) for k in range(3)], compare=False)
+    assert found.fit.values["extends_m_per_kpa"] == pytest.approx(extends, rel=0.1)
+    assert mean_error(found.held, "chord_m") < 0.5 * mean_error(found.others["without extension"], "chord_m")
 
 
 @pytest.mark.slow

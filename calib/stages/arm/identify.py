@@ -45,8 +45,9 @@ from calib.stages.arm.model import (
     segment_run,
 )
 
-_TRIED = ("toe", "inertia")
-"""Parts that are taken where they predict held trials better."""
+_BY_ANGLE, _BY_CHORD = ("angle_by_pressure_rad", "angle_rad"), ("chord_m",)
+_TRIED = {"toe": _BY_ANGLE, "inertia": _BY_ANGLE, "extension": _BY_CHORD}
+"""Parts that are taken where they predict held trials better, by the first of these that there is."""
 FULL = Assembly(tuple(part.name for part in PARTS if part.name not in ("lag", "pump", *_TRIED)))
 WORTH = ("stiffening", "hysteresis", "creep", "settling", "load")
 """Parts whose worth is measured by leaving them out."""
@@ -416,13 +417,17 @@ _WORTHWHILE = 0.8
 """Held error with smaller errors, of that with the usual ones, that speaks for them."""
 
 
-def _mean_held_error(trials: Sequence[Trial], held: Mapping[str, Fit]) -> float:
-    """Geometric mean error of the held trials' angle by what drives the segment most closely.
+def _mean_held_error(
+    trials: Sequence[Trial], held: Mapping[str, Fit], quantities: Sequence[str] = _BY_ANGLE
+) -> float:
+    """Geometric mean error of the held trials in the first quantity that there is, infinite without one.
+
+    By default that is the angle by what drives the segment most closely.
 
     A trial that alone holds its load or day is far off whatever the parts, and outweighs no other.
     """
     errors = _held_errors(trials, held).values()
-    for name in ("angle_by_pressure_rad", "angle_rad"):
+    for name in quantities:
         values = [one[name] for one in errors if math.isfinite(one[name])]
         if values:
             return math.exp(sum(math.log(max(x, 1e-9)) for x in values) / len(values))
@@ -567,11 +572,10 @@ def _choose_assembly(trials: Sequence[Trial], assembly: Assembly, drive: str, ot
             assembly, held, errors = driven, fits, by_other
         else:
             others[f"a {other_drive} for the {drive}"] = by_other
-    for name in _TRIED if any(len(one.angle_rad) for one in trials) else ():
+    for name, by in _TRIED.items() if any(len(one.angle_rad) for one in trials) else ():
         more = Assembly((*assembly.parts, name))
-        if _mean_held_error(trials, held_fits(trials, more, scale)) <= _WORTHWHILE * _mean_held_error(
-            trials, held
-        ):
+        reached = _mean_held_error(trials, held_fits(trials, more, scale), by)
+        if reached < _WORTHWHILE * _mean_held_error(trials, held, by):
             others[f"without {name}"] = errors
             assembly = more
             scale, held = _fit_without_each(trials, assembly, replace(scale, finer=1.0))
@@ -627,8 +631,10 @@ def mean_error(errors: Mapping[str, Errors], quantity: str) -> float:
     return sum(values) / len(values) if values else math.nan
 
 
-def gain_over_baseline(found: Identification, baseline: str, quantity: str) -> tuple[float, float]:
-    """By how much smaller the mean held error is than a baseline's, and half its paired 95 % interval.
+def gain_over_baseline(
+    found: Identification, baseline: str, quantity: str, level: float = 0.95
+) -> tuple[float, float]:
+    """By how much smaller the mean held error is than a baseline's, and half its paired interval at a level.
 
     Both are shares of the baseline's mean; the half is NaN for fewer than two trials.
     """
@@ -638,5 +644,6 @@ def gain_over_baseline(found: Identification, baseline: str, quantity: str) -> t
     if not len(less):
         return math.nan, math.nan
     n = len(less)
-    half = float(stdtrit(n - 1, 0.975)) * float(less.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+    t = float(stdtrit(n - 1, 0.5 * (1.0 + level))) if n > 1 else math.nan
+    half = t * float(less.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
     return float(less.mean()) / mean, half / mean

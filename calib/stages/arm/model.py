@@ -37,7 +37,8 @@ that of the chord, which recovers in a time of its own:
 
 W = C sin(.55 phi) + D cos(.55 phi) is by how much the moment m g l of a load at the tip of an arm of length l
 bends it, whose chord leans by about .55 of the angle: C > 0 of one that stands, C < 0 of one that hangs, D of
-one that lies. Chord: L = c_0 + c_1 phi + c_2 phi^2 - s'.
+one that lies. Chord: L = c_0 + c_1 phi + c_2 phi^2 + x p_f - s', x of a chamber that lengthens the arm by its
+pressure, before it bends, and 0 of others.
 
 What differs from day to day is a factor of a, and of D or G: an arm is refitted, its rubber rests, and so do
 the valve's springs.
@@ -254,13 +255,18 @@ PARTS = (
             Parameter("lengthens_per_kpa", "1/kPa", 1.2, 0.8, "vented starts", powers=(-1, 0, 0, 0)),
         ),
     ),
+    Part(
+        "extension",
+        (Parameter("extends_m_per_kpa", "m/kPa", 0.0, 0.05, _STEPS, powers=(-1, 0, 1, 0)),),
+        {"extends_m_per_kpa": 0.0},
+    ),
 )
 """In the order of the parameters."""
 
 PARAMETERS = tuple(one for part in PARTS for one in part.parameters)
 DRIVES = {part.name: tuple(one.name for one in part.parameters) for part in PARTS if part.drives}
 """Parameters of the parts that make the pressure."""
-CHORD = tuple(one.name for part in PARTS if part.name == "chord" for one in part.parameters)
+CHORD = tuple(one.name for part in PARTS if part.name in ("chord", "extension") for one in part.parameters)
 SEGMENT = tuple(one.name for part in PARTS if not part.drives for one in part.parameters)
 COMPLIANCE = tuple(one.name for part in PARTS if part.name == "load" for one in part.parameters)
 DAILY = {"pilot_drains": 0.1, "kpa_per_command": 0.1, "delivers_per_s": 0.1, "bends_rad_per_kpa": 0.15}
@@ -411,16 +417,16 @@ def _segment(pressure: FloatArray, angle: float, chord: float, q: FloatArray, mo
         settling_s,
         sooner,
     ) = q[:15]
-    compliance, across, c0, c1, c2, lengthens_s, longer = q[15:]
+    compliance, across, c0, c1, c2, lengthens_s, longer, extends = q[15:]
     out = np.empty((len(pressure), 2))
-    short = lacks = c0 + c1 * angle + c2 * angle * angle - chord
+    short = lacks = c0 + c1 * angle + c2 * angle * angle + extends * pressure[0] - chord
     elastic, crept = 0.0, 0.0
     inside, rate = pressure[0], 0.0
     squared = max(swings, 0.02) ** 2
     follows, fills = 1.0 - math.exp(-STEP_S / lag), 1.0 - math.exp(-STEP_S / fill)
     for k in range(len(pressure)):
         out[k, 0] = angle
-        out[k, 1] = c0 + c1 * angle + c2 * angle * angle - lacks
+        out[k, 1] = c0 + c1 * angle + c2 * angle * angle + extends * inside - lacks
         inside += fills * (pressure[k] - inside)
         weighs = moment * load_bends(angle, compliance, across)
         bends = linear * inside

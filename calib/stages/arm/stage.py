@@ -32,6 +32,9 @@ _COARSE = 0.1
 """Error of a held trial, of the angle's range, above which a prediction is none."""
 _MATTERS = 0.005
 """Of the angle's range or the chord, by which a black box has to be better to count."""
+_BEYOND_CHANCE = 0.8
+"""Level of the paired interval that a black box' gain has to be outside of, 10 % on its side: of a few trials
+one alone holds its day or its load, and is predicted by chance."""
 _SHORT = 0.01
 _LEAST_RAD = math.radians(0.5)
 
@@ -183,7 +186,8 @@ def _beside_black_boxes(found: Identification) -> Iterator[Finding]:
             f"{'smaller' if mean > 0.0 else 'larger'} than that of {name} (paired, 95 %)"
         )
         size = scale.chord_m if quantity == "chord_m" else scale.angle_rad
-        worse = -mean * mean_error(found.others[name], quantity) > _MATTERS * size
+        _, chance = gain_over_baseline(found, name, quantity, _BEYOND_CHANCE)
+        worse = -mean > chance and -mean * mean_error(found.others[name], quantity) > _MATTERS * size
         yield Finding("poor" if worse else "remark", text)
 
 
@@ -282,9 +286,9 @@ def _vented_starts(found: Identification) -> Iterator[Finding]:
     for trial in found.trials:
         if not len(trial.angle_rad):
             continue
-        _, phi, chord_m = trial.begins
+        kpa, phi, chord_m = trial.begins
         curve = values["chord_m"] + values["chord_m_per_rad"] * phi + values["chord_m_per_rad2"] * phi**2
-        short = curve - chord_m
+        short = curve + values["extends_m_per_kpa"] * kpa - chord_m
         if short > _SHORT * values["chord_m"]:
             yield Finding(
                 "remark", f"{trial.name} starts {1e3 * short:.1f} mm too short: a vented start, it settles"
