@@ -97,6 +97,15 @@ def test_commands_stay_within_their_limits(errors: list[float], tracking_s: floa
         assert 10.0 <= step_back(channel, error, 10.0, 200.0, tracking_s) <= 200.0
 
 
+def test_without_an_integral_none_follows_the_limits() -> None:
+    """Nothing would empty it again: a PD that was beyond its limits once would be off for ever."""
+    channel = Channel(Pid(100.0, 0.0, 1.0))
+    for _ in range(100):
+        step_back(channel, 3.0, 0.0, 255.0, 0.5)
+    step_back(channel, 1.0, 0.0, 255.0, 0.5)
+    assert step_back(channel, 1.0, 0.0, 255.0, 0.5) == pytest.approx(100.0)
+
+
 def test_a_constant_error_beyond_the_limit_settles_the_integral() -> None:
     """At rest Ki e = (v - u) / Tt: the integral stops a known way beyond the limit, it does not wind up."""
     channel = Channel(Pid(100.0, 50.0, 0.0))

@@ -17,6 +17,7 @@ from source_model import head_from_marker, inverse_series
 from ticks import Ticks, run_gains
 
 import calib
+from calib.core.errors import BadInputError
 from calib.io.serial import MODE_OFF, MODE_ORIENTATION, MODE_POSITION, Inputs
 from calib.stages.camera.model import Camera, undistort
 from calib.stages.control.laws import Channel, FeedForward, Pid, feed_forward
@@ -39,6 +40,7 @@ from calib.stages.firmware.conformance import (
 from calib.stages.firmware.header import Header, make_header
 from calib.stages.firmware.vectors import (
     FUSED_TICKS,
+    MOST_TIMES,
     PERIOD,
     Motion,
     binary32,
@@ -218,6 +220,38 @@ def test_the_self_test_passes_at_other_ticks(tmp_path: Path, rate_hz: float) -> 
     write(tmp_path, make_header(whole, "rig.yaml"))
     for fused in (0, 1):
         assert selftest(tmp_path, "selftest", f"-DCALIB_FUSED={fused}")
+
+
+@pytest.mark.parametrize("rate_hz", [400.0, 1000.0])
+def test_a_fast_board_holds_a_sensor_for_more_ticks_than_a_row_of_the_self_test_counts(
+    tmp_path: Path, rate_hz: float
+) -> None:
+    whole = rig("nominal")
+    whole = whole.with_sections({"lowpass": calib.lowpass(whole, rate_hz=rate_hz)})
+    made = make_header(whole, "rig.yaml")
+    assert made.values["CALIB_HOLD_TICKS"] > MOST_TIMES
+    write(tmp_path, made)
+    assert selftest(tmp_path, "selftest")
+
+
+def test_a_lens_that_is_undone_in_a_part_of_the_picture_only_is_refused() -> None:
+    """Beyond what its polynomial was fitted to, the powers of a wide brown5 passed any float."""
+    tilted = {"CALIB_PLANE_NORMALISED_31": 1.0, "CALIB_PLANE_NORMALISED_32": -1.0}
+    constants = header("full").values | tilted | {"CALIB_LENS_INVERSE_C5": 1e30}
+    with pytest.raises(BadInputError, match=r"camera: .* without bound at pixel \(\d+, \d+\), expected"):
+        vectors(constants, limits=True)
+
+
+@pytest.mark.parametrize("fused", [0, 1])
+def test_a_controller_without_integral_has_none_that_follows_the_limits(tmp_path: Path, fused: int) -> None:
+    """A PD beside the back-calculation of `calib control tune`: board, reference and simulation agree."""
+    tuned = rig("full").controller
+    assert tuned is not None
+    assert tuned.orientation.back_calculation_s > 0.0
+    plain = tuned.orientation.model_copy(update={"Ki_pwm_per_rad_s": 0.0})
+    whole = rig("full").with_sections({"controller": tuned.model_copy(update={"orientation": plain})})
+    write(tmp_path, make_header(whole, "rig.yaml"))
+    assert selftest(tmp_path, "selftest", f"-DCALIB_FUSED={fused}")
 
 
 def test_signs_of_the_imus_axes(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def saturate(u: float, low: float = PWM_MIN, high: float = PWM_MAX) -> float:
 #
 # Within the limits this is (4.4), and so computed, with the sum I_k - Ki h e_(k-1) / 2. Beyond them the
 # integral follows the limited command with the time constant Tt instead of standing still, as it does in
-# the source's clamping (4.1.1).
+# the source's clamping (4.1.1). Where Ki = 0 there is no integral: I = 0, as nothing would empty it again.
 #
 # The limits are not 0 and 255 alone. A bellows deflates slowly while the pump's lag runs ahead of it: a
 # command of 0 empties the lag within 2 s, the force needs 5 s, and before the force can be held again the
@@ -122,7 +122,8 @@ def step_back(channel: Channel, error: float, low: float, high: float, tracking_
     """One tick, with Tt = `tracking_s`. Returns the command within its limits [PWM]."""
     v = channel.step(error)
     u = min(max(v, low), high)
-    channel.sum += channel.pid.tick_s * (u - v) / tracking_s
+    if channel.pid.Ki:
+        channel.sum += channel.pid.tick_s * (u - v) / tracking_s
     return u
 
 

@@ -3,7 +3,7 @@
 Per tick of `tick_s`, with PWM values between `pwm_low` and `pwm_high`:
 
     orientation   v = Kp e + I + Ki h e / 2 + Kd (e - e_before) / h,   e = +-(phi_ref - phi)
-                  u = limit(v),   I += h (Ki e + (u - v) / back_calculation_s)
+                  u = limit(v),   I += h (Ki e + (u - v) / back_calculation_s),   I = 0 where Ki = 0
     position      v = Kp e + Kd (e - e_before) / h + feed-forward,     e = q_ref - q
 
 The feed-forward is `force_pwm` read at the force that the rest at q_ref needs (`feedforward`). The lower

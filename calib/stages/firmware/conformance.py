@@ -185,9 +185,11 @@ class Reference:
         xd = (u_px - c["CAMERA_CX_PX"] - c["CAMERA_SKEW_PX"] * yd) * c["CAMERA_PER_FX"]
 
         def radial(r2: float) -> float:
-            return 1.0 + sum(
-                c[f"LENS_INVERSE_C{i}"] * r2**i for i in range(1, int(c["LENS_INVERSE_ORDER"]) + 1)
-            )
+            # By Horner, as far from the picture a power is no float.
+            more = 0.0
+            for i in range(int(c["LENS_INVERSE_ORDER"]), 0, -1):
+                more = r2 * (more + c[f"LENS_INVERSE_C{i}"])
+            return 1.0 + more
 
         P = radial(xd * xd + yd * yd)
         x, y = xd * P, yd * P

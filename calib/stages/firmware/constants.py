@@ -305,7 +305,8 @@ def _pid(lookup: Lookup, name: str, word: str, default: Pid, rate_hz: float) -> 
     tuned = lookup.find(f"controller.{name}")
     if not isinstance(tuned, OrientationGains):
         return {**gains, "clamping": default.clamping, "back": 0.0, "falling_share": None}
-    back = 1.0 / (rate_hz * tuned.back_calculation_s)
+    # Without an integral there is none to follow the limits.
+    back = 1.0 / (rate_hz * tuned.back_calculation_s) if Ki else 0.0
     return {**gains, "clamping": False, "back": back, "falling_share": tuned.falling_share}
 
 

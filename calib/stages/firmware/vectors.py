@@ -53,6 +53,10 @@ _LATE_STEP, _LATE_FROM, _LATE_KINDS = 0.25, -0.25, 8
 """Lateness of pictures among the ticks, what is refused included: whole multiples, as three bits hold."""
 
 
+MOST_TIMES = 256
+"""That a tick comes in a vector; a board that ticks faster holds a sensor for longer."""
+
+
 @dataclass(frozen=True)
 class Vector:
     """One tick, or `times` of them that are alike: what goes in, and what has to come out of the last.
@@ -242,6 +246,8 @@ def vectors(
     Parameters
     ----------
     fused : for CALIB_FUSED 1. limits : with all that a tick has to refuse.
+
+    Raises `BadInputError` for a lens that the constants do not undo all over the picture.
     """
     reference = make_reference(constants, fused=fused)
     run = directed_fused(constants, ticks, period=ticks) if fused else directed(constants, ticks)
@@ -261,8 +267,16 @@ def vectors(
             given += _bent(constants, coherent(constants, ticks, period=ticks))
     made = []
     for one, times in given:
-        out = [reference.step(one) for _ in range(times)][-1]
-        made.append(Vector(one, out, times, tuple(reference.count.values())))
+        for done in range(0, times, MOST_TIMES):
+            more = min(times - done, MOST_TIMES)
+            out = [reference.step(one) for _ in range(more)][-1]
+            if not all(map(math.isfinite, out.numbers)):
+                raise BadInputError(
+                    f"camera: what undoes its lens is without bound at pixel ({one.u_px:.0f}, "
+                    f"{one.v_px:.0f}), expected a place of every pixel; run calib intrinsics on pictures of "
+                    "the board up to the edges, or with a simpler --model"
+                )
+            made.append(Vector(one, out, more, tuple(reference.count.values())))
     return made
 
 
@@ -301,7 +315,6 @@ def _words(made: list[Vector]) -> list[int]:
     words = []
     for one in made:
         kind = round((one.given.late_ticks - _LATE_FROM) / _LATE_STEP)
-        assert one.times <= 256
         words += [one.given.sensors + 4 * one.given.mode + 32 * (one.times - 1) + 8192 * kind]
         words += [one.wanted.flags]
     return words
