@@ -708,7 +708,7 @@ def test_a_rate_of_another_scale_or_one_that_comes_late_is_named(
 def test_a_swing_that_begins_with_a_jerk_along_the_head_contradicts_nothing(seed: int) -> None:
     """A head that was pulled aside is stretched by a millimetre or two: more than g at first.
 
-    Ten means over half a second hardly tell the rate's noise then.
+    A few means hardly tell the rate's noise then.
     """
     t, rng = 0.01 * np.arange(500), np.random.default_rng(seed)
     swing = 0.33 * np.exp((-1.35 + 26.4j) * t)
@@ -757,6 +757,25 @@ def test_a_quick_swing_does_not_bend_the_smoothed_angle() -> None:
     found = smooth_log(*run, DATA_SHEET.gyro, DATA_SHEET.walk)
     assert np.degrees(np.nanstd(found.phi_rad - piece.reference_rad)) < 0.3
     assert abs(found.scale - 1.0) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("swing_hz", "lasts_s", "size_deg", "lever_m"),
+    [(2.0, 15.0, 15.0, 0.1), (2.0, 15.0, 40.0, 0.1), (2.0, 1e9, 15.0, -0.2), (1.5, 1e9, 15.0, -0.2)],
+)
+def test_a_log_that_begins_in_a_swing_tells_lever_from_scale(
+    swing_hz: float, lasts_s: float, size_deg: float, lever_m: float
+) -> None:
+    """A pendulum, or a tone with the sensor above the pivot; the lever is felt as much as gravity."""
+    t, rng = 0.01 * np.arange(6000), np.random.default_rng(3)
+    pole = complex(-1.0 / lasts_s, 2.0 * np.pi * swing_hz)
+    phi, dphi, ddphi = (np.radians(size_deg) * (pole**k * np.exp(pole * t + 0.5j)).real for k in range(3))
+    ax = 9.80665 * np.cos(phi) + lever_m * dphi**2 + rng.normal(0.0, 0.015, len(t))
+    ay = 9.80665 * np.sin(phi) + lever_m * ddphi + rng.normal(0.0, 0.015, len(t))
+    rate = dphi + 0.004 + rng.normal(0.0, 0.0025, len(t))
+    found = smooth_log(t, np.arctan2(ay, ax), rate, DATA_SHEET.gyro, DATA_SHEET.walk)
+    assert abs(found.scale - 1.0) < 0.08
+    assert np.degrees((found.phi_rad - phi).std()) < 0.5
 
 
 def test_a_knock_does_not_bend_the_smoothed_angle() -> None:

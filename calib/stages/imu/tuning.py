@@ -297,22 +297,29 @@ def compared(
 # The rate integrated, theta, follows every motion but drifts; the accelerometer's angle does not drift but
 # feels every acceleration. Their difference d = phi_acc - theta is explained by
 #
-#     delta' = -(b + s w) + n,   b' = n_b,   c' = -c / tau + n_c,   d = delta + (X1 rx + X2 ry) + c + v
+#     delta' = -(b + s w) + n,   b' = n_b,   c' = -c / tau + n_c,   d = delta + asin(X1 rx + X2 ry) + c + v
 #
 # with the bias b and the scale error s of the gyroscope, a lever (rx, ry) from the centre of rotation to
 # the sensor, whose accelerations follow from the rate,
 #
-#     X1 = (alpha cos phi + w^2 sin phi) / g,   X2 = (alpha sin phi - w^2 cos phi) / g,   alpha = dgz/dt,
+#     X1 = (alpha cos phi_acc + w^2 sin phi_acc) / g,   X2 = (alpha sin phi_acc - w^2 cos phi_acc) / g,
+#
+# with alpha = dgz/dt, the slope of cubics over 0.2 s: one that dampens a swing, or that is as noisy as
+# differences, has the scale explain what the lever did. The arcsine is linearised, first about no lever, then
+# about the one that was found. There are
 #
 # white noises n, n_b of the gyroscope, and of the accelerometer white noise v and accelerations c that last
 # for a time tau. A Kalman filter forwards and the smoother of Rauch, Tung and Striebel backwards give phi =
 # theta + delta. How much of c and v there is depends on the motion, and a rate that is not quite that of the
 # angle adds to n: densities, tau and the size of c are those that make the log most likely, from means over
-# half a second. What the accelerometer feels stays bounded and what the gyroscope gathers does not, by which
-# the two are told apart.
+# a quarter of a second. What the accelerometer feels stays bounded and what the gyroscope gathers does not,
+# by which the two are told apart.
 
 BLOCK_S = 0.05
-_COARSE_S = 0.5
+_COARSE_S = 0.25
+_SLOPE_S, _SLOPE_POWER = 0.2, 3
+_LINEARISED = 2
+_MOST_SINE = 0.9
 SHORTEST_S = 4.0
 _LIKELY_BLOCKS = 2400
 _LASTING_S = (0.3, 1.0, 3.0)
@@ -451,18 +458,24 @@ def _means(values: FloatArray, starts: FloatArray, counts: FloatArray) -> FloatA
     return np.asarray(np.add.reduceat(values, starts.astype(np.int64))) / counts
 
 
-def _blocks(
-    t: FloatArray, theta: FloatArray, w: FloatArray, phi_acc: FloatArray, d: FloatArray, size_s: float
-) -> _Blocks:
-    number = np.floor((t - t[0]) / size_s)
+def _levers(t: FloatArray, w: FloatArray, phi_acc: FloatArray) -> FloatArray:
+    """X (n, 2)."""
+    from scipy.signal import savgol_filter
+
+    size = max(2 * int(0.5 * _SLOPE_S * (len(t) - 1) / (t[-1] - t[0])) + 1, _SLOPE_POWER + 2)
+    slope, step = (savgol_filter(values, size, _SLOPE_POWER, deriv=1) for values in (w, t))
+    alpha, c, s = -slope / step, np.cos(phi_acc), np.sin(phi_acc)
+    return np.stack([alpha * c + w**2 * s, alpha * s - w**2 * c], axis=1) / GRAVITY_MPS2
+
+
+def _blocks(t: FloatArray, theta: FloatArray, d: FloatArray, X: FloatArray, size_s: float) -> _Blocks:
+    # Stamps on the border of two blocks begin the later one, however they are rounded.
+    number = np.floor((t - t[0]) / size_s + 1e-6)
     starts = np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0).astype(np.float64)
     counts = np.diff(np.append(starts, len(t)))
-    tb, th, db = (_means(values, starts, counts) for values in (t, theta, d))
-    c, s, rate = (_means(values, starts, counts) for values in (np.cos(phi_acc), np.sin(phi_acc), w))
+    tb, th, db, X1, X2 = (_means(values, starts, counts) for values in (t, theta, d, *X.T))
     dt = np.diff(tb, prepend=tb[0] - size_s)
-    alpha = -np.gradient(rate, tb) if len(tb) > 2 else np.zeros(len(tb))
-    X = np.stack([alpha * c + rate**2 * s, alpha * s - rate**2 * c], axis=1) / GRAVITY_MPS2
-    return _Blocks(tb, db, X, dt, np.diff(th, prepend=th[0]))
+    return _Blocks(tb, db, np.stack([X1, X2], axis=1), dt, np.diff(th, prepend=th[0]))
 
 
 @kernel()
@@ -537,15 +550,20 @@ def smooth_log(
     r_least = max(0.5 * float(np.median(np.diff(d) ** 2)) / 0.4549 * period, 1e-12)
     q_b = gyro_walk**2
     P = np.diag([1.0, _BIAS_SIGMA_RADPS**2, _SCALE_SIGMA**2, _LEVER_SIGMA_M**2, _LEVER_SIGMA_M**2, 0.0])
-    coarse = _blocks(t, theta, rate_radps, phi_acc_rad, d, _COARSE_S)
-    q, r, tau, c = _likely(coarse, gyro_noise**2, q_b, r_least, P).tolist()
-    fine = _blocks(t, theta, rate_radps, phi_acc_rad, d, BLOCK_S)
-    # What swings within half a second is noise that only the fine blocks show.
-    noisier = np.array([(q, r * 4.0**k, tau, c) for k in range(_NOISIER)])
-    r = float(_most_likely(fine, q_b, P, noisier)[1])
-    xs, Ps = np.empty((len(fine.d), _STATES)), np.empty((len(fine.d), _STATES, _STATES))
-    of = _Densities(q, q_b, r, tau, c)
-    _forward(fine, of, P, xs, Ps)
+    levers, lever_m = _levers(t, rate_radps, phi_acc_rad), np.zeros(2)
+    for _ in range(_LINEARISED):
+        sine = np.clip(levers @ lever_m, -_MOST_SINE, _MOST_SINE)
+        X = levers / np.sqrt(1.0 - sine**2)[:, None]
+        left = d - np.arcsin(sine) + X @ lever_m
+        coarse, fine = (_blocks(t, theta, left, X, size_s) for size_s in (_COARSE_S, BLOCK_S))
+        q, r, tau, c = _likely(coarse, gyro_noise**2, q_b, r_least, P).tolist()
+        # What swings within a quarter of a second is noise that only the fine blocks show.
+        noisier = np.array([(q, r * 4.0**k, tau, c) for k in range(_NOISIER)])
+        r = float(_most_likely(fine, q_b, P, noisier)[1])
+        xs, Ps = np.empty((len(fine.d), _STATES)), np.empty((len(fine.d), _STATES, _STATES))
+        of = _Densities(q, q_b, r, tau, c)
+        _forward(fine, of, P, xs, Ps)
+        lever_m = xs[-1, 3:5].copy()
     last, scale_sigma = xs[-1].copy(), math.sqrt(float(Ps[-1, 2, 2]))
     variance = _backward(fine, of, xs, Ps)
     phi = theta + offset + np.interp(t, fine.t_s, xs[:, 0])
