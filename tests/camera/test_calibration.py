@@ -17,11 +17,10 @@ from sets import SPOILS, Recipe, camera_of, take
 from calib.stages.camera.bundle import (
     Calibration,
     calibrate,
-    closed_form_intrinsics,
     covariance,
-    homographies,
     joint_jacobian,
     linearise,
+    poses_with_camera,
     projection_sigma_px,
     rotation_exp,
 )
@@ -212,12 +211,23 @@ def test_identical_views_are_named_singular_or_stalled_not_solved() -> None:
 @pytest.mark.parametrize(("unknowns", "views"), [("skew", 3), ("no skew", 2), ("centre", 1)])
 def test_the_fewest_views_suffice(unknowns: str, views: int) -> None:
     skew = 3.0 if unknowns == "skew" else 0.0
-    centre = (319.5, 239.5) if unknowns == "centre" else (325.0, 236.0)
+    centre, fixed = ((319.5, 239.5), ("cx_px", "cy_px")) if unknowns == "centre" else ((325.0, 236.0), ())
     camera = Camera("pinhole", (640, 480), 530.0, 545.0, skew, *centre)
-    H = homographies(pack(views_of(views, 4, camera=camera)))
-    K = closed_form_intrinsics(H, (640, 480), unknowns)
-    assert K is not None
-    np.testing.assert_allclose(K, camera.K, rtol=1e-6, atol=1e-4)
+    seen = pack(views_of(views, 4, camera=camera))
+    fit = calibrate(seen, (640, 480), "pinhole", skew=skew != 0.0, fixed=fixed)
+    np.testing.assert_allclose(fit.camera.K, camera.K, rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("field_deg", [3.0, 5.0, 8.0, 20.0])
+@pytest.mark.parametrize("k1", [-0.06, 0.05])
+def test_the_lens_of_a_narrow_field_leads_to_no_wrong_minimum(field_deg: float, k1: float) -> None:
+    # Within its noise such a view looks alike with its board leaning the other way; the lens outweighs that.
+    lens = (k1 / (1.2 * np.tan(np.radians(field_deg / 2))) ** 2,)
+    camera = camera_of(field_deg=field_deg, lens=lens)
+    seen = pack(take(np.random.default_rng(1), camera, 12, BOARD.points_m()))
+    found = calibrate(seen, (640, 480), "radial2")
+    from_truth = calibrate(seen, (640, 480), "radial2", start=poses_with_camera(camera, seen))
+    assert found.squared_sum < from_truth.squared_sum + 0.1 * from_truth.sigma_px**2
 
 
 def _block(seed: int, deformation: int = 0) -> Block:

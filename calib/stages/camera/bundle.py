@@ -1,9 +1,10 @@
-"""A camera fitted to all views of a target: start (Zhang), Levenberg-Marquardt, fit, covariance."""
+"""A camera fitted to all views of a target: start, Levenberg-Marquardt, fit, covariance."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -246,59 +247,16 @@ def _decrement(at: Linearised, G: int, step: tuple[FloatArray, FloatArray], free
 
 
 # ----------------------------------------------------------------------
-# Closed-form initial guess of a camera from views of a plane (Zhang 2000).
+# Homographies of the views of a plane, and the poses that they give with a known camera.
 #
 # A view's homography H = [h1 h2 h3] maps the target's plane to pixels and equals s K [r1 r2 t] (2.9
-# with the K that its printed form lacks). r1 and r2 are orthonormal, so that with B = K^-T K^-1
-#
-#     h1^T B h2 = 0,   h1^T B h1 = h2^T B h2
-#
-# are two equations linear in B for each view. Five unknown ratios of B (skew included) need three
-# views, four (no skew) need two, and two (principal point held at the image's centre) need one.
+# with the K that its printed form lacks).
 
 
 def homographies(observations: Observations) -> FloatArray:
     """Homography from the target's plane (metres) to pixels for each view, shape (N, 3, 3)."""
     present = observations.present.astype(np.float64)
     return linear_homographies(observations.target_m[..., :2], observations.pixels, present)
-
-
-def _constraint(H: FloatArray, i: int, j: int) -> FloatArray:
-    """Row v_ij of Zhang's system, (N, 6): h_i^T B h_j = v_ij . (B11, B12, B22, B13, B23, B33)."""
-    product = H[:, :, None, i] * H[:, None, :, j]
-    both = product + product.transpose(0, 2, 1)
-    return np.asarray(both[:, [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]] * [0.5, 1.0, 0.5, 1.0, 1.0, 0.5])
-
-
-def closed_form_intrinsics(H: FloatArray, image_size_px: tuple[int, int], unknowns: str) -> FloatArray | None:
-    """K from homographies, or None where noise or geometry leave no real solution.
-
-    Parameters
-    ----------
-    H : (N, 3, 3).
-    unknowns : "skew" (all of B), "no skew", or "centre" (principal point at the image's centre).
-    """
-    width, height = image_size_px
-    size = 0.5 * (width + height)
-    # Pixels about the image's centre and of order one condition the system.
-    normalise = np.array(
-        [[1 / size, 0, -0.5 * (width - 1) / size], [0, 1 / size, -0.5 * (height - 1) / size], [0, 0, 1]]
-    )
-    Hn = normalise @ H
-    Hn = Hn / np.linalg.norm(Hn, axis=(1, 2), keepdims=True)
-    system = np.concatenate([_constraint(Hn, 0, 1), _constraint(Hn, 0, 0) - _constraint(Hn, 1, 1)])
-    kept = {"skew": [0, 1, 2, 3, 4, 5], "no skew": [0, 2, 3, 4, 5], "centre": [0, 2, 5]}[unknowns]
-    if len(system) < len(kept) - 1:
-        return None
-    b = np.zeros(6)
-    b[kept] = np.linalg.eigh(system[:, kept].T @ system[:, kept])[1][:, 0]
-    B = np.array([[b[0], b[1], b[3]], [b[1], b[2], b[4]], [b[3], b[4], b[5]]]) * np.sign(b[0] or 1.0)
-    if np.linalg.eigvalsh(B)[0] <= 0.0:
-        return None
-    # B = K^-T K^-1 = L L^T with L lower triangular, hence K = L^-T up to scale.
-    K = np.linalg.inv(np.linalg.cholesky(B)).T
-    K = np.linalg.inv(normalise) @ (K / K[2, 2])
-    return np.asarray(K / K[2, 2])
 
 
 def poses_from_homographies(K: FloatArray, H: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -335,48 +293,6 @@ def poses_with_camera(camera: Camera, observations: Observations) -> Block:
         R_CT, t_CT_m = poses_from_homographies(np.eye(3), homographies(seen))
     R_CT[~enough], t_CT_m[~enough] = np.nan, np.nan
     return Block.of(camera, R_CT, t_CT_m)
-
-
-def _mismatch(K: FloatArray, H: FloatArray) -> float:
-    """How far K^-1 H is from two orthonormal columns, mean over views of a dimensionless error."""
-    M = np.linalg.solve(K, H)
-    a, b = M[:, :, 0], M[:, :, 1]
-    aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
-    return float(np.mean(((aa - bb) ** 2 + 4 * ab**2) / (aa + bb) ** 2))
-
-
-def initial_guess(observations: Observations, image_size_px: tuple[int, int], skew: bool) -> Block:
-    """Intrinsics without distortion and the poses of all views, as a start for the bundle adjustment.
-
-    Zhang's closed form with as many unknowns as the views allow; where that has no plausible answer
-    the principal point is held at the centre, and where that fails too the focal length of a scan
-    that makes the target's axes most nearly orthonormal is taken.
-    """
-    H = homographies(observations)
-    width, height = image_size_px
-    longest = float(max(width, height))
-    centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
-    attempts = (["skew"] if skew and observations.views >= 3 else []) + (
-        ["no skew"] if observations.views >= 2 else []
-    )
-    found = (closed_form_intrinsics(H, image_size_px, unknowns) for unknowns in [*attempts, "centre"])
-    K = next((one for one in found if one is not None and _plausible(one, longest, centre)), None)
-    if K is None:
-        focal = longest * np.geomspace(0.3, 10.0, 60)
-        candidates = [np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1.0]]) for f in focal]
-        K = min(candidates, key=lambda candidate: _mismatch(candidate, H))
-    if not skew:
-        K[0, 1] = 0.0
-    R_CT, t_CT_m = poses_from_homographies(K, H)
-    intrinsics = np.zeros(len(INTRINSICS))
-    intrinsics[:5] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]
-    return Block(intrinsics, R_CT, t_CT_m)
-
-
-def _plausible(K: FloatArray, longest: float, centre: FloatArray) -> bool:
-    """Focal lengths between a fifth and fifty times the image, principal point near the image."""
-    focal, off = np.diag(K)[:2] / longest, np.abs(K[:2, 2] - centre) / longest
-    return bool(np.all(np.isfinite(K)) and np.all((focal > 0.2) & (focal < 50.0) & (off < 1.0)))
 
 
 # ----------------------------------------------------------------------
@@ -483,33 +399,26 @@ class Calibration:
         return float(np.sqrt(psi / freedom) / share)
 
 
-def starting_block(
-    observations: Observations, image_size_px: tuple[int, int], skew: bool, free: IntArray
-) -> Block:
-    """Zhang's closed form as a start, with k1 and k2 by linear least squares where they are free."""
-    start = initial_guess(observations, image_size_px, skew)
-    lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
-    if not np.isin(lens, free).all():
-        return start
-    at = linearise(start, observations, lens, None)
-    if at is None:
-        return start
-    normal, gradient = at.normal[:, :2, :2].sum(axis=0), at.gradient[:, :2].sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    if np.linalg.cond(normal / scale / scale[:, None]) < _WELL_CONDITIONED:
-        start.intrinsics[lens] = -np.linalg.solve(normal, gradient)
-    return start
+# Where to start. The cost has wrong minima: of the focal length, and of each view's tilt, since a distant
+# plane looks almost as it does leaning the other way along the line of sight, and in a narrow field a lens
+# outweighs the difference. So the lens comes first, by what holds at any focal length and tilt: without it
+# the views are homographies of the target. Then the focal length, by which the axes of all targets are most
+# nearly orthonormal (Zhang 2000), then k1 and k2, a few steps, and each view leaning the other way where that
+# agrees better.
 
-
+_DIVISIONS = np.linspace(-1.0, 0.6, 17)
+"""Values of d in x / (1 + d |x|^2), a lens about the picture's centre, in units of its larger side."""
+_FOCALS = np.geomspace(0.2, 40.0, 90)
+"""Focal lengths, over the picture's larger side."""
+_WIDE_STARTS = np.geomspace(0.15, 1.5, 6)
+"""Those to begin a fisheye lens with; 1 / pi shows half a sphere."""
+_FIRST_ITERATIONS, _TILTINGS = 16, 2
 _ANGLES_AS_LENGTHS = {
     "rational8": {"k1": 7 / 9, "k2": 64 / 945, "k4": 10 / 9, "k5": 5 / 21},
     "fisheye4": {},
 }
 """Coefficients of a lens that shows angles as lengths: of the rational model the Pade approximant
 atan(r) / r = (1 + 7/9 r2 + 64/945 r2^2) / (1 + 10/9 r2 + 5/21 r2^2), right to a percent up to 60 degrees."""
-_WIDE_STARTS = np.geomspace(0.15, 1.5, 12)
-"""Focal lengths to begin a fisheye lens with, over the picture's larger side; 1 / pi shows half a sphere."""
-_TRIED_ITERATIONS = 12
 
 
 def equidistant_start(
@@ -526,24 +435,107 @@ def equidistant_start(
     ----------
     model : "rational8" or "fisheye4".
     """
-    width, height = image_size_px
-    intrinsics = np.zeros(len(INTRINSICS))
-    intrinsics[:2] = focal_px
-    intrinsics[2:4] = 0.5 * (width - 1), 0.5 * (height - 1)
+    intrinsics = _centred(image_size_px, focal_px)
     for name, value in _ANGLES_AS_LENGTHS[model].items():
         intrinsics[INTRINSICS.index(name)] = value
     return poses_with_camera(camera_from_vector(model, image_size_px, intrinsics), observations)
 
 
-def _fisheye_start(observations: Observations, image_size_px: tuple[int, int], free: IntArray) -> Block:
-    """A start for a fisheye lens: the best of several focal lengths after a few steps."""
-    size = max(image_size_px)
-    starts = [equidistant_start(observations, image_size_px, share * size, FISHEYE) for share in _WIDE_STARTS]
-    starts = [start for start in starts if start.posed.all()]
-    tried = [minimise(start, observations, free, max_iterations=_TRIED_ITERATIONS) for start in starts]
-    if not any(np.isfinite(one.cost) for one in tried):
-        return replace(initial_guess(observations, image_size_px, skew=False), fisheye=True)
-    return min(tried, key=lambda one: one.cost).block
+def _centred(image_size_px: tuple[int, int], focal_px: float) -> FloatArray:
+    """Intrinsics (13,) of a lens without distortion about the picture's centre."""
+    intrinsics = np.zeros(len(INTRINSICS))
+    intrinsics[:4] = focal_px, focal_px, 0.5 * (image_size_px[0] - 1), 0.5 * (image_size_px[1] - 1)
+    return intrinsics
+
+
+def first_block(
+    observations: Observations, image_size_px: tuple[int, int], model: str, free: IntArray
+) -> Block:
+    """Where to start without a guess, after a few steps; a lens of ratios has at most two coefficients."""
+    steps = partial(minimise, observations=observations, max_iterations=_FIRST_ITERATIONS, tolerance=ENOUGH)
+    if model == FISHEYE:
+        starts = [
+            equidistant_start(observations, image_size_px, share * max(image_size_px), FISHEYE)
+            for share in _WIDE_STARTS
+        ]
+        ends = [steps(start, free=free) for start in starts if start.posed.all()]
+        best = min(ends, key=lambda one: one.cost, default=None)
+        if best is not None and best.at is not None:
+            return best.block
+        return replace(_straight_start(observations, image_size_px), fisheye=True)
+    first = free[np.isin(free, free_intrinsics("radial2", True))]
+    found = steps(_with_lens(_straight_start(observations, image_size_px), observations, first), free=first)
+    for _ in range(_TILTINGS):
+        found = steps(_best_tilts(found, observations), free=first)
+    return found.block
+
+
+def _straight_start(observations: Observations, image_size_px: tuple[int, int]) -> Block:
+    """Focal length and poses from homographies by the lens that makes them fit best, without that lens."""
+    size, present = max(image_size_px), observations.present.astype(np.float64)
+    centre = _centred(image_size_px, 1.0)[2:4]
+    seen = (observations.pixels - centre) / size
+    plane = np.broadcast_to(observations.target_m[..., :2], seen.shape)
+
+    def without_lens(division: float) -> tuple[FloatArray, float]:
+        stretch = 1.0 + division * np.sum(seen**2, axis=2, keepdims=True)
+        H = linear_homographies(plane, seen / stretch, present)
+        mapped = plane @ H[..., :2].transpose(0, 2, 1) + H[:, None, :, 2]
+        # Brought back to the picture, so that a lens that shrinks it gains nothing.
+        off = mapped[..., :2] / mapped[..., 2:] * stretch - seen
+        return H, float(np.sum(off**2 * present[..., None]))
+
+    costs = np.array([without_lens(division)[1] for division in _DIVISIONS])
+    k = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+    left, least, right = costs[k - 1 : k + 2]
+    bend = left - 2 * least + right
+    # The vertex of a parabola through the three; a finer grid finds no other start.
+    part = np.clip(0.5 * (left - right) / bend, -1.0, 1.0) if 0.0 < bend < np.inf else 0.0
+    H = without_lens(_DIVISIONS[k] + part * (_DIVISIONS[1] - _DIVISIONS[0]))[0]
+    focal = min(_FOCALS, key=lambda share: _mismatch(H / [[share], [share], [1.0]]))
+    R_CT, t_CT_m = poses_from_homographies(np.diag([focal, focal, 1.0]), H)
+    return Block(_centred(image_size_px, focal * size), R_CT, t_CT_m)
+
+
+def _mismatch(axes: FloatArray) -> float:
+    """How far the first two columns (N, 3, 3) are from orthonormal ones, mean over views, dimensionless."""
+    a, b = axes[:, :, 0], axes[:, :, 1]
+    aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
+    return float(np.mean(((aa - bb) ** 2 + 4 * ab**2) / (aa + bb) ** 2))
+
+
+def _with_lens(start: Block, observations: Observations, free: IntArray) -> Block:
+    """The start with k1 and k2 by linear least squares, where they are free and the views tell them."""
+    lens = np.array([INTRINSICS.index("k1"), INTRINSICS.index("k2")])
+    at = linearise(start, observations, lens, None) if np.isin(lens, free).all() else None
+    if at is None:
+        return start
+    normal, gradient = at.normal[:, :2, :2].sum(axis=0), at.gradient[:, :2].sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    if np.linalg.cond(normal / scale / scale[:, None]) < _WELL_CONDITIONED:
+        start.intrinsics[lens] = -np.linalg.solve(normal, gradient)
+    return start
+
+
+def _best_tilts(found: Minimum, observations: Observations) -> Block:
+    """The block with each view leaning the other way along its line of sight where it then agrees better."""
+    block, present = found.block, observations.present[..., None]
+    middle = (observations.target_m * present).sum(axis=1) / present.sum(axis=1)
+    place = np.einsum("nij,nj->ni", block.R_CT, middle) + block.t_CT_m
+    sight = place / np.linalg.norm(place, axis=1, keepdims=True)
+    axes = block.R_CT[..., :2] - 2 * sight[..., None] * (sight[:, None] @ block.R_CT[..., :2])
+    R_CT = np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], axis=2)
+    mirrored = replace(block, R_CT=R_CT, t_CT_m=place - np.einsum("nij,nj->ni", R_CT, middle))
+    none = np.zeros(0, dtype=np.int64)
+    other = minimise(mirrored, observations, none, max_iterations=_FIRST_ITERATIONS, tolerance=ENOUGH)
+    if other.at is None or found.at is None:
+        return block
+    better = (other.at.residuals**2).sum(axis=(1, 2)) < (found.at.residuals**2).sum(axis=(1, 2))
+    return replace(
+        block,
+        R_CT=np.where(better[:, None, None], other.block.R_CT, block.R_CT),
+        t_CT_m=np.where(better[:, None], other.block.t_CT_m, block.t_CT_m),
+    )
 
 
 def calibrate(
@@ -568,18 +560,16 @@ def calibrate(
     fixed : names of intrinsics held at the start's values.
     basis : (K, 3, M) deformation of the target, which then has to be the same in all views.
     loss : "none", "huber" or "cauchy"; its scale is the median of the plain fit's residuals.
-    start : where to start; Zhang's closed form by default, for a fisheye lens the best of several focal
-        lengths. The start of another kind of lens is not used.
+    start : where to start; `first_block` by default, and where it is a start of another kind of lens.
+        Coefficients that the model lacks are not taken.
     tolerance : see `minimise`.
     """
     free = free_intrinsics(model, skew, fixed)
     if start is None or start.fisheye != (model == FISHEYE):
         # A lens of angles and one of ratios have nothing but poses in common.
-        start = (
-            _fisheye_start(observations, image_size_px, free)
-            if model == FISHEYE
-            else starting_block(observations, image_size_px, skew, free)
-        )
+        start = first_block(observations, image_size_px, model, free)
+    known = np.isin(np.arange(len(INTRINSICS)), free_intrinsics(model, True))
+    start = replace(start, intrinsics=np.where(known, start.intrinsics, 0.0))
     deformations = 0 if basis is None else len(basis)
     if len(start.deformation) != deformations:
         start = replace(start, deformation=np.zeros(deformations))

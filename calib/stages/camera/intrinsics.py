@@ -259,14 +259,19 @@ def candidates_by_model(
         fit = calibrate(observations, image_size_px, model, skew=skew, loss=loss, start=start, **_ROUGHLY)
         return None if fit.termination in ("behind the camera", "singular") else fit
 
-    for model in MODELS:
-        fit = None if model == FISHEYE else fitted(model, fits[-1].block if fits else None)
+    order = list(MODELS)
+    # The pinhole comes last: it tilts boards to make up for the lens, and richer models stay where it led.
+    for model in [one for one in order if one not in ("pinhole", FISHEYE)]:
+        fit = fitted(model, fits[-1].block if fits else None)
         if fit is not None and model == "rational8" and not skew:
             fit = _sturdier(fit, fits)
         fits += [] if fit is None else [fit]
+    pinhole = fitted("pinhole", fits[0].block if fits else None)
+    fits += [] if pinhole is None else [pinhole]
     if any(map(_wide, fits)):
-        fit, order = fitted(FISHEYE, None), list(MODELS)
-        fits = sorted(fits if fit is None else [*fits, fit], key=lambda one: order.index(one.camera.model))
+        fit = fitted(FISHEYE, None)
+        fits += [] if fit is None else [fit]
+    fits.sort(key=lambda one: order.index(one.camera.model))
     held = _on_held_back(fits)
     return [
         (_candidate(str(LensModel.of(fit)), fit, held[i], _soundness(fit)), fit) for i, fit in enumerate(fits)
@@ -283,18 +288,20 @@ def _wide(fit: Calibration) -> bool:
 
 
 def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
-    """The rational model from another start, where the simpler ones fold or it does.
+    """The rational model from other starts, where it is worth them and it or a simpler one folds."""
+    sound = [checks.lens_shape(one).one_to_one for one in simpler]
+    least = min((one.rms_px for one, good in zip(simpler, sound, strict=True) if good), default=np.inf)
+    if not fit.rms_px < _LESS * least or (all(sound) and checks.lens_shape(fit).one_to_one):
+        return fit
+    return _of_other_starts(fit, simpler)
+
+
+def _of_other_starts(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
+    """The rational model from more starts: one without a pole in the picture if it fits as well.
 
     Its cost has many minima. A simpler model that folds leads into a wrong one, and noise alone makes some
     with a pole in the picture, next to a zero that hides it.
     """
-    sound = [checks.lens_shape(one).one_to_one for one in (*simpler, fit)]
-    if not fit.rms_px < _LESS * min(
-        (one.rms_px for one, good in zip(simpler, sound, strict=False) if good), default=np.inf
-    ):
-        return fit
-    if all(sound):
-        return fit
     observations, size = fit.observations, fit.camera.image_size_px
     fitted = partial(refitted, fit, **_ROUGHLY)
     starts = [equidistant_start(observations, size, share * max(size)) for share in _EQUIDISTANT]
@@ -303,9 +310,11 @@ def _sturdier(fit: Calibration, simpler: Sequence[Calibration]) -> Calibration:
         starts.append(fitted(start=simpler[-1].block, fixed=("k6",)).block)
     fits = [fit, *(fitted(start=start) for start in starts)]
     fits = [one for one in fits if np.isfinite(one.rms_px)]
-    least = min(one.rms_px for one in fits)
+    least = min((one.rms_px for one in fits), default=np.inf)
     return min(
-        fits, key=lambda one: (one.rms_px > _SAME * least, not checks.lens_shape(one).one_to_one, one.rms_px)
+        fits,
+        key=lambda one: (one.rms_px > _SAME * least, not checks.lens_shape(one).one_to_one, one.rms_px),
+        default=fit,
     )
 
 
@@ -462,6 +471,12 @@ def _chosen_model(
 ) -> tuple[LensModel, Calibration | None, tuple[Candidate, ...]]:
     """The lens model, a fit of it to start from, and the comparison that chose it."""
     asked = bool(choices.skew)
+    if choices.model == "rational8" and observations.views >= 3:
+        simpler = calibrate(observations, image_size_px, "brown5", skew=asked, loss=choices.loss, **_ROUGHLY)
+        fit = refitted(simpler, model="rational8", **_ROUGHLY)
+        if not checks.lens_shape(fit).one_to_one:
+            fit = _of_other_starts(fit, [simpler])
+        return LensModel(choices.model, asked), fit, ()
     if choices.model != "auto":
         return LensModel(choices.model, asked), None, ()
     if observations.views < 3:

@@ -72,7 +72,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0xF74F3D4BUL
+#define CALIB_ID 0x242C0EFAUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -107,7 +107,7 @@
 #define CALIB_LENS_INVERSE_C2 -0.333819926f /* coefficient of r2^2, dimensionless */
 #define CALIB_LENS_INVERSE_C3 -1.56958032f /* coefficient of r2^3, dimensionless */
 #define CALIB_LENS_INVERSE_C4 3.43781137f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06487942f /* coefficient of r2^5, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06487918f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
@@ -129,7 +129,7 @@
  */
 #define CALIB_PLANE_NORMALISED_11 1.00040591f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_12 -0.0241296869f /* row 1, A^-1 K, dimensionless to m */
-#define CALIB_PLANE_NORMALISED_13 -0.0202337801f /* row 1, A^-1 K, dimensionless to m */
+#define CALIB_PLANE_NORMALISED_13 -0.020233782f /* row 1, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_21 0.021691177f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_22 0.987333477f /* row 2, A^-1 K, dimensionless to m */
 #define CALIB_PLANE_NORMALISED_23 0.220940679f /* row 2, A^-1 K, dimensionless to m */

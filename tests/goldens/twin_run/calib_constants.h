@@ -80,7 +80,7 @@
 #endif
 
 /* First 32 bits of the SHA-256 of the values, to tell calibrations apart in telemetry. */
-#define CALIB_ID 0x40219AF9UL
+#define CALIB_ID 0xEBAC290DUL
 
 /* Whether these constants may drive a rig. The guard compiles for a board only where they may. */
 #define CALIB_RIG_OK 0 /* 0: a section that they come from is not ok, or no controller is tuned */
@@ -115,7 +115,7 @@
 #define CALIB_LENS_INVERSE_C2 -0.333819926f /* coefficient of r2^2, dimensionless */
 #define CALIB_LENS_INVERSE_C3 -1.56958032f /* coefficient of r2^3, dimensionless */
 #define CALIB_LENS_INVERSE_C4 3.43781137f /* coefficient of r2^4, dimensionless */
-#define CALIB_LENS_INVERSE_C5 -2.06487942f /* coefficient of r2^5, dimensionless */
+#define CALIB_LENS_INVERSE_C5 -2.06487918f /* coefficient of r2^5, dimensionless */
 #define CALIB_LENS_INVERSE_P(r2) (1.0f + (r2) * (CALIB_LENS_INVERSE_C1 + (r2) * (CALIB_LENS_INVERSE_C2 + (r2) * (CALIB_LENS_INVERSE_C3 + (r2) * (CALIB_LENS_INVERSE_C4 + (r2) * (CALIB_LENS_INVERSE_C5)))))) /* P by Horner's scheme */
 
 /* Plane of the actuator, without the shift and stretch that align has found. */
@@ -239,7 +239,7 @@
 #define CALIB_FUSED_DELAY_TICKS 1.51304853f /* D, ticks from the exposure of a picture to its tick */
 #define CALIB_FUSED_ACCEL_11 0.000259515946f /* row 1, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_12 4.81279949e-06f /* row 1, of ay, rad per m/s^2 */
-#define CALIB_FUSED_ACCEL_1 2.11632068e-05f /* row 1, of the biases, subtracted, rad */
+#define CALIB_FUSED_ACCEL_1 2.1163205e-05f /* row 1, of the biases, subtracted, rad */
 #define CALIB_FUSED_ACCEL_21 -4.8062011e-06f /* row 2, of ax, K_a / g times mount and scale, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_22 0.000259872235f /* row 2, of ay, rad per m/s^2 */
 #define CALIB_FUSED_ACCEL_2 -8.63058176e-06f /* row 2, of the biases, subtracted, rad */
