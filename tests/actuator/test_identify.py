@@ -726,9 +726,9 @@ def test_what_could_not_be_told_is_what_is_asked_for(of_steps: Solution) -> None
 T = np.arange(480) / 60.0
 
 
-def _swing(zeta: float = 0.05, hz: float = 4.0, offset: float = 0.0) -> np.ndarray:
+def _swing(zeta: float = 0.05, hz: float = 4.0, offset: float = 0.0, phase_rad: float = 0.0) -> np.ndarray:
     w = 2.0 * np.pi * hz
-    swing = 0.5 * np.exp(-zeta * w * T) * np.cos(w * np.sqrt(1.0 - zeta**2) * T)
+    swing = 0.5 * np.exp(-zeta * w * T) * np.cos(w * np.sqrt(1.0 - zeta**2) * T + phase_rad)
     return swing + offset * np.exp(-T / 0.4)
 
 
@@ -737,6 +737,17 @@ def test_the_ratio_of_an_ideal_swing(zeta: float) -> None:
     found = decrement(T, _swing(zeta))
     assert found.zeta == pytest.approx(zeta, rel=0.03)
     assert found.frequency_hz == pytest.approx(4.0 * np.sqrt(1.0 - zeta**2), rel=0.01)
+
+
+def test_sigma_covers_swings_that_a_log_begins_anywhere_in() -> None:
+    rng = np.random.default_rng(0)
+    phases = np.linspace(0.0, 2.0 * np.pi, 50, endpoint=False)
+    noise = 2e-3 * rng.standard_normal((len(phases), len(T)))
+    found = [decrement(T, _swing(phase_rad=phases[i]) + noise[i], 2e-3) for i in range(len(phases))]
+    z = np.array([(one.zeta - 0.05) / one.sigma for one in found])
+    assert np.mean(np.abs(z) < 2.0) > 0.9
+    assert abs(z.mean()) < 0.5
+    np.testing.assert_allclose([one.frequency_hz for one in found], 4.0 * np.sqrt(1.0 - 0.05**2), rtol=5e-3)
 
 
 def test_an_offset_that_creeps_does_not_count() -> None:

@@ -138,10 +138,11 @@ def decrement(t_s: FloatArray, phi_rad: FloatArray, noise_rad: float = 0.0) -> D
     """
     y, outliers = without_outliers(np.asarray(phi_rad, dtype=np.float64))
     turns = _turns(y, 0.3)
+    reach = max(round(0.25 * float(np.median(np.diff(turns)))), 1) if len(turns) > 1 else 1
+    # The first row of a log that begins in a swing stands out and is no extreme.
+    turns = turns[turns >= reach]
     if len(turns) < _FEWEST:
         raise BadInputError(f"swing: found {len(turns)} extremes, expected at least {_FEWEST}")
-    rows = float(np.median(np.diff(turns)))
-    reach = max(round(0.25 * rows), 1)
     ends = [_vertex(t_s, y, int(i), reach) for i in turns]
     at, peak = _regular(t_s, y, np.array([e[0] for e in ends]), np.array([e[1] for e in ends]))
     height = np.abs(np.diff(peak))
@@ -161,7 +162,8 @@ def decrement(t_s: FloatArray, phi_rad: FloatArray, noise_rad: float = 0.0) -> D
     by_noise = math.sqrt(float(np.sum((lever * noise_rad / height[:used]) ** 2))) / total
     spread = 1.2 * max(scatter / math.sqrt(total), by_noise)
     delta, delta_sigma = -2.0 * slope, 2.0 * spread
-    half = float(np.median(np.diff(at[: used + 1])))
+    # Whole periods: an offset that creeps makes one half longer than the other.
+    half = 0.5 * float(np.median(at[2 : used + 1] - at[: used - 1]))
     norm = math.hypot(delta, 2.0 * math.pi)
     return Decrement(
         delta / norm,
