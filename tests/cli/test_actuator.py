@@ -303,7 +303,7 @@ def test_a_log_and_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str
     log = read_log(tmp_path / "log.csv")
     assert len(log) == 120 + 200
     assert f"swing: 2 s, 320 rows written to {tmp_path / 'log.csv'}" in shown.out
-    assert "damping_ratio 0.0545" in shown.out
+    assert "damping_ratio 0.0544" in shown.out
     assert "simulated" in shown.err
 
 
